@@ -25,7 +25,9 @@ is_for_ros = not {"install", "develop"}.isdisjoint(sys.argv)
 
 def files(pattern):
     """Relative paths, as setuptools wants its data files."""
-    return sorted(path.relative_to(HERE).as_posix() for path in HERE.glob(pattern))
+    return sorted(
+        path.relative_to(HERE).as_posix() for path in HERE.glob(pattern)
+    )
 
 
 def all_commands():
@@ -39,12 +41,15 @@ def all_commands():
 def readme():
     """The README, its links made absolute for pages that have nothing else of the repository."""
     text = (HERE / "README.md").read_text(encoding="utf-8")
-    return re.sub(r"\]\((?![a-z]+:|#)", f"]({addresses['repository']}/raw/main/", text)
+    return re.sub(
+        r"\]\((?![a-z]+:|#)", f"]({addresses['repository']}/raw/main/", text
+    )
 
 
 setup(
     name=name,
-    version=manifest.findtext("version") + manifest.findtext("export/pre_release", ""),
+    version=manifest.findtext("version")
+    + manifest.findtext("export/pre_release", ""),
     description=manifest.findtext("description"),
     long_description=readme(),
     long_description_content_type="text/markdown",
@@ -137,7 +142,12 @@ setup(
             "pytest-xdist>=3.5",
             "wheel",
         ],
-        "lint": ["import-linter==2.17", "mypy==2.4.1", "ruff==0.17.5", "types-PyYAML"],
+        "lint": [
+            "import-linter==2.17",
+            "mypy==2.4.1",
+            "ruff==0.17.5",
+            "types-PyYAML",
+        ],
     },
     entry_points={
         "console_scripts": [

@@ -41,7 +41,9 @@ def changed(name: str, factor: float) -> Tuning:
         return float(number + np.log(factor)) if is_log else factor * number
 
     new_value = (
-        tuple(map(multiplied, value)) if isinstance(value, tuple) else multiplied(value)
+        tuple(map(multiplied, value))
+        if isinstance(value, tuple)
+        else multiplied(value)
     )
     return dataclasses.replace(TUNING, **{name: new_value})
 
@@ -71,7 +73,9 @@ def measured(cases: Sequence[Case], tuning: Tuning = TUNING) -> FloatArray:
 def main() -> None:
     """Draw, solve and write ``constants.csv``."""
     parser = study_parser("benchmarks.constants", __doc__)
-    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    parser.add_argument(
+        "--seed", type=int, help="default: another one at every run"
+    )
     arguments = parser.parse_args()
     cases = chosen(arguments.data_folder, seed_of(arguments.seed))
     whole = measured(cases)

@@ -35,7 +35,11 @@ from pathlib import Path
 import numpy as np
 
 PROJECT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(PROJECT), str(PROJECT / "benchmarks"), str(PROJECT / "test")]
+sys.path[:0] = [
+    str(PROJECT),
+    str(PROJECT / "benchmarks"),
+    str(PROJECT / "test"),
+]
 
 from suite.data import START_NS, STREAMS, T_PARENT_CHILD, parts  # noqa: E402
 from suite.table import Table, show  # noqa: E402
@@ -88,7 +92,9 @@ def measured_node(report, arguments):
     from hand_eye_calib.online.ros.node import main
 
     if SLOW in os.environ:
-        cycle.SolvingProcess = functools.partial(SolvingProcess, command=SLOW_SOLVER)
+        cycle.SolvingProcess = functools.partial(
+            SolvingProcess, command=SLOW_SOLVER
+        )
 
     latencies = []
     durations = []
@@ -217,7 +223,9 @@ def start(domain, *words, **more):
         "PYTHONUNBUFFERED": "1",
     }
     command = [sys.executable, __file__, *map(str, words)]
-    return subprocess.Popen(command, env=os.environ | environment | more, cwd=PROJECT)
+    return subprocess.Popen(
+        command, env=os.environ | environment | more, cwd=PROJECT
+    )
 
 
 def children(pid):
@@ -225,7 +233,9 @@ def children(pid):
     found = []
     for task in Path(f"/proc/{pid}/task").iterdir():
         with contextlib.suppress(OSError):  # a thread that has just ended
-            found += map(int, (task / "children").read_text(encoding="ascii").split())
+            found += map(
+                int, (task / "children").read_text(encoding="ascii").split()
+            )
     return found
 
 
@@ -259,13 +269,16 @@ def slow_processor(node, share):
         groups.append(group)
     cores = os.sched_getaffinity(0)
     waking = [
-        subprocess.Popen([sys.executable, "-c", WAKES_UP, str(core)]) for core in cores
+        subprocess.Popen([sys.executable, "-c", WAKES_UP, str(core)])
+        for core in cores
     ]
 
     def undo():
         end(waking)
         for group in groups:
-            for pid in (group / "cgroup.procs").read_text(encoding="ascii").split():
+            for pid in (
+                (group / "cgroup.procs").read_text(encoding="ascii").split()
+            ):
                 (group.parent / "cgroup.procs").write_text(pid)
             group.rmdir()
 
@@ -348,7 +361,12 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
         rows = [(what, value, "", True) for what, value, _, _ in rows]
     return [
         *rows,
-        ("messages lost, as reported", str(reported), "within 2 %", is_reported),
+        (
+            "messages lost, as reported",
+            str(reported),
+            "within 2 %",
+            is_reported,
+        ),
         ("callback p50 / p99 / p99.9 / max (ms)", callbacks, "", True),
         ("CPU (cores)", f"{seen['cpu']:.2f}", "", True),
         ("pairs, error (mm) of the last", last, "", True),
@@ -376,12 +394,16 @@ def soak(hours):
     history = []
     for hour in range(hours):
         times = []
-        for first in range(hour * 60 * minute, (hour + 1) * 60 * minute, minute):
+        for first in range(
+            hour * 60 * minute, (hour + 1) * 60 * minute, minute
+        ):
             streams = parts(first, minute, rate_hz).items()
             for k in range(minute):
                 for stream, (stamps_ns, positions, quats) in streams:
                     begun = time.perf_counter()
-                    calibrator.add_pose(stream, stamps_ns[k], positions[k], quats[k])
+                    calibrator.add_pose(
+                        stream, stamps_ns[k], positions[k], quats[k]
+                    )
                     times.append(time.perf_counter() - begun)
         p99 = float(np.percentile(times, 99))
         del times, streams
@@ -390,8 +412,12 @@ def soak(hours):
             begun = time.perf_counter()
             result = calibrator.estimate()
             solves.append(time.perf_counter() - begun)
-        history.append((resident_mb(), 1e3 * float(np.median(solves)), 1e6 * p99))
-        said = "{:.1f} MB, solve {:.0f} ms, per pose p99 {:.1f} us".format(*history[-1])
+        history.append(
+            (resident_mb(), 1e3 * float(np.median(solves)), 1e6 * p99)
+        )
+        said = "{:.1f} MB, solve {:.0f} ms, per pose p99 {:.1f} us".format(
+            *history[-1]
+        )
         print(f"hour {hour + 1}: {said}, {result.n_poses} poses", flush=True)
     first_mb, first_ms, _ = history[0]
     last_mb, last_ms, _ = history[-1]
@@ -420,7 +446,9 @@ def resident_mb():
     ctypes.CDLL(None).malloc_trim(0)
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(
-        int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:")
+        int(line.split()[1]) / 1024
+        for line in lines
+        if line.startswith("VmRSS:")
     )
 
 
@@ -451,7 +479,9 @@ def kill(folder, kills):
     for attempt in range(kills + 1):
         node = NodeProcess(domain, folder / f"node{attempt}.log", words)
         if attempt:
-            resumed += f"{count} poses" in node.wait_for_log("session resumed from")
+            resumed += f"{count} poses" in node.wait_for_log(
+                "session resumed from"
+            )
         if attempt == kills:
             break
         peer.wait_matched(*publishers)
@@ -472,7 +502,8 @@ def kill(folder, kills):
         count = len(journal.stamps_ns)
         newest_ns = START_NS + (first - 1) * 1_000_000_000 // rate_hz
         lost_s.append(
-            (newest_ns - min(newest(journal, stream) for stream in STREAMS)) * 1e-9
+            (newest_ns - min(newest(journal, stream) for stream in STREAMS))
+            * 1e-9
         )
         # The node adds its own topics.
         unchanged += before.items() <= fingerprints(output).items()
@@ -524,7 +555,10 @@ def earlier_result():
 
 def fingerprints(folder):
     files = [path for path in folder.iterdir() if path.is_file()]
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
 
 
 # ---------------------------------------------------------------------- main
@@ -539,15 +573,21 @@ def main(arguments):
     parser = argparse.ArgumentParser(
         description="Load, soak and crashes of the node, measured."
     )
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="all by default")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of a load")
+    parser.add_argument(
+        "parts", nargs="*", choices=[*PARTS, []], help="all by default"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="length of a load"
+    )
     parser.add_argument(
         "--hours", type=int, default=10, help="length of soak, simulated"
     )
     parser.add_argument(
         "--kills", type=int, default=20, help="how often to kill the node"
     )
-    parser.add_argument("--share", type=float, default=0.4, help="of a core, for share")
+    parser.add_argument(
+        "--share", type=float, default=0.4, help="of a core, for share"
+    )
     options = parser.parse_args(arguments)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
@@ -560,7 +600,9 @@ def main(arguments):
             return load(loaded_node(folder, part, options.seconds))
         if part == "share":
             hard = functools.partial(slow_processor, share=options.share)
-            seen = loaded_node(folder, part, options.seconds, hard, **{SLOW: "1"})
+            seen = loaded_node(
+                folder, part, options.seconds, hard, **{SLOW: "1"}
+            )
             return load(seen, MOST_LATENCY_OF_A_SHARE_S)
         n_programs = 4 * (os.cpu_count() or 1)
         hard = lambda _: others(n_programs)  # noqa: E731

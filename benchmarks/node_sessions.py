@@ -37,7 +37,11 @@ from pathlib import Path
 import numpy as np
 
 PROJECT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(PROJECT), str(PROJECT / "benchmarks"), str(PROJECT / "test")]
+sys.path[:0] = [
+    str(PROJECT),
+    str(PROJECT / "benchmarks"),
+    str(PROJECT / "test"),
+]
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import TransformStamped  # noqa: E402
@@ -179,7 +183,9 @@ def park(streams):
     for name in ("parent", "child"):
         times_s = getattr(streams, f"{name}_s")
         Ts = getattr(streams, f"Ts_{name}")
-        moving_s = np.where(times_s < 25.0, times_s, np.maximum(25.0, times_s - 30.0))
+        moving_s = np.where(
+            times_s < 25.0, times_s, np.maximum(25.0, times_s - 30.0)
+        )
         setattr(streams, f"Ts_{name}", Ts[nearest(times_s, moving_s)])
 
 
@@ -199,7 +205,11 @@ def replace_start(streams, until_s, motion):
         Ts = getattr(streams, f"Ts_{name}")
         T_world_body = T_world_pw @ T_pw_body
         is_early = times_s < until_s
-        Ts_body = se3.inverse(T_world_body) @ Ts[is_early] @ se3.inverse(T_body_sensor)
+        Ts_body = (
+            se3.inverse(T_world_body)
+            @ Ts[is_early]
+            @ se3.inverse(T_body_sensor)
+        )
         Ts_new = motion(times_s[is_early] - until_s, Ts_body)
         Ts[is_early] = T_world_body @ Ts_new @ T_body_sensor
 
@@ -244,7 +254,10 @@ SESSIONS = {
         must_appear="CHECK THE STREAMS",
     ),
     "wrong installed": Session(
-        90.0, "DONE", parameters=QUIET | {"installed": ""}, must_appear="HAS MOVED"
+        90.0,
+        "DONE",
+        parameters=QUIET | {"installed": ""},
+        must_appear="HAS MOVED",
     ),
     "contradicted prior": Session(
         60.0,
@@ -253,9 +266,14 @@ SESSIONS = {
         must_appear="contradicts",
     ),
     "two publishers": Session(
-        60.0, "BAD INPUT|CHECK", second_publisher_s=30.0, must_appear="publishers"
+        60.0,
+        "BAD INPUT|CHECK",
+        second_publisher_s=30.0,
+        must_appear="publishers",
     ),
-    "straight start": Session(90.0, "DONE", parameters=QUIET, accident=start_straight),
+    "straight start": Session(
+        90.0, "DONE", parameters=QUIET, accident=start_straight
+    ),
     "straight, curves, ramps": Session(
         160.0,
         "DONE",
@@ -275,7 +293,9 @@ SESSIONS = {
         55.0, "PAUSED|CHECK INPUT", parameters=QUIET, accident=end_child
     ),
     "ramps, 10 min": Session(600.0, "DONE", vehicle="agv_ramps"),
-    "flat, then ramps, 10 min": Session(600.0, "DONE", vehicle="agv_long", flat_s=90.0),
+    "flat, then ramps, 10 min": Session(
+        600.0, "DONE", vehicle="agv_long", flat_s=90.0
+    ),
 }
 
 
@@ -303,7 +323,10 @@ def simulated(session, seed):
     if session.accident:
         session.accident(streams)
     streams.Ts_parent, streams.Ts_child = add_noise(
-        streams.Ts_parent, streams.Ts_child, REALISTIC, np.random.default_rng(seed)
+        streams.Ts_parent,
+        streams.Ts_child,
+        REALISTIC,
+        np.random.default_rng(seed),
     )
     return streams, drive.T_parent_child
 
@@ -317,11 +340,17 @@ def simulated_vehicle(session, seed):
     drive = simulate(kind, (seed,))
     start_ns = min(drive.parent.stamps_ns[0], drive.child.stamps_ns[0])
     times_s = [
-        (stream.stamps_ns - start_ns) * 1e-9 for stream in (drive.parent, drive.child)
+        (stream.stamps_ns - start_ns) * 1e-9
+        for stream in (drive.parent, drive.child)
     ]
     poses = [stream.poses.copy() for stream in (drive.parent, drive.child)]
     streams = Streams(
-        times_s[0], poses[0], times_s[1], poses[1], drive.T_parent_child, np.eye(4)
+        times_s[0],
+        poses[0],
+        times_s[1],
+        poses[1],
+        drive.T_parent_child,
+        np.eye(4),
     )
     return streams, drive.T_parent_child
 
@@ -344,8 +373,12 @@ class Page:
     @property
     def headline(self):
         """Word, sentence and advice in one line."""
-        section = re.search(r'<section class="headline">(.*?)</section>', self.html)
-        paragraphs = re.findall(r'<p(?: class="advice")?>([^<]*)</p>', section[1])
+        section = re.search(
+            r'<section class="headline">(.*?)</section>', self.html
+        )
+        paragraphs = re.findall(
+            r'<p(?: class="advice")?>([^<]*)</p>', section[1]
+        )
         return unescape(f"{self.word}: {' '.join(paragraphs)}")
 
     @property
@@ -389,7 +422,10 @@ class Witness:
 
             self._subscribe(node, TFMessage, "/tf_static", self.broadcasts)
         self._notes = folder / "watch.txt"
-        environment = {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(folder)}
+        environment = {
+            "ROS_DOMAIN_ID": str(domain),
+            "XDG_STATE_HOME": str(folder),
+        }
         command = [
             sys.executable,
             "-m",
@@ -423,7 +459,9 @@ class Witness:
         self.states.append((time.time(), state))
 
     def _take_diagnostics(self, array):
-        by_name = {status.name.rpartition(": ")[2]: status for status in array.status}
+        by_name = {
+            status.name.rpartition(": ")[2]: status for status in array.status
+        }
         self.diagnostics.append((time.time(), by_name))
 
     def _read_page(self):
@@ -487,7 +525,8 @@ def essence(state):
         progress and (progress.done, progress.sentence),
         state.headline,
         state.standing,
-        state.extrinsic and (state.extrinsic.tf_static, state.extrinsic.contradicted),
+        state.extrinsic
+        and (state.extrinsic.tf_static, state.extrinsic.contradicted),
         state.has_ended,
     )
 
@@ -541,8 +580,12 @@ def compare_bars(page, progress):
         progress.axes[key].sigma <= progress.axes[key].target
         for key in AXIS_KEYS.values()
     ]
-    by_hand = [progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()]
-    if any(a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)):
+    by_hand = [
+        progress.axes[key].seconds_left == 0 for key in AXIS_KEYS.values()
+    ]
+    if any(
+        a != (b or c) for a, b, c in zip(full, within, by_hand, strict=True)
+    ):
         yield f"full bars {full}, axes within their target {within}"
     if progress.done and not all(full):
         yield "DONE with a bar that is not full"
@@ -559,7 +602,9 @@ def compare_topics(witness, state, now_s):
         T = matrix(transform[1])
         pose = [result.pose[axis] for axis in "xyz"]
         known = [axis for axis in range(3) if pose[axis] is not None]
-        off_m = max((abs(T[axis, 3] - pose[axis]) for axis in known), default=0.0)
+        off_m = max(
+            (abs(T[axis, 3] - pose[axis]) for axis in known), default=0.0
+        )
         if off_m > 1e-6:
             yield f"~/extrinsic differs by {1e3 * off_m:.3g} mm from the state"
     diagnostics = newest(witness.diagnostics, now_s)
@@ -590,7 +635,10 @@ def not_logged(witness, log):
     headlines = [state.headline for _, state in witness.states]
     logged = re.sub(NUMBERS, "", log)
     for headline, group in itertools.groupby(headlines):
-        if len(list(group)) >= 3 and re.sub(NUMBERS, "", headline) not in logged:
+        if (
+            len(list(group)) >= 3
+            and re.sub(NUMBERS, "", headline) not in logged
+        ):
             yield f"not in the log: {headline}"
 
 
@@ -651,11 +699,15 @@ def promises(witness, start_s, end_s, flat_s):
         if any(row.sigma > row.target for row in state.axes.values()):
             outside_s = second
         # The first ramp comes within a period, and takes 8 s.
-        change_s += state.will_not_get_there and second > flat_s + RAMP_PERIOD_S + 8.0
+        change_s += (
+            state.will_not_get_there and second > flat_s + RAMP_PERIOD_S + 8.0
+        )
         if math.isfinite(state.seconds_left):
             ratios.append(state.seconds_left / (done_s - second))
     n_good_times = sum(0.5 <= ratio <= 2.0 for ratio in ratios)
-    return Promises(done_s - outside_s, float(change_s), len(ratios), n_good_times)
+    return Promises(
+        done_s - outside_s, float(change_s), len(ratios), n_good_times
+    )
 
 
 def end_contradictions(witness, log, folder):
@@ -675,7 +727,11 @@ def end_contradictions(witness, log, folder):
     state = witness.states[-1][1]
     if state.result and not file.exists():
         yield "a result, but no file"
-    if file.exists() and witness.transforms and state.standing is Standing.CURRENT:
+    if (
+        file.exists()
+        and witness.transforms
+        and state.standing is Standing.CURRENT
+    ):
         saved = load_result(file).T_parent_child
         if not np.allclose(saved, matrix(witness.transforms[-1][1]), atol=1e-9):
             yield "extrinsic.yaml and ~/extrinsic differ"
@@ -723,7 +779,8 @@ def run(name, session, folder, seed):
         peer.close()
     problems = list(contradictions(witness, start_s, end_s))
     problems += [
-        (math.inf, text) for text in end_contradictions(witness, node.log, folder)
+        (math.inf, text)
+        for text in end_contradictions(witness, node.log, folder)
     ]
     problems += [(math.inf, text) for text in not_logged(witness, node.log)]
     if session.vehicle:
@@ -766,7 +823,8 @@ def publish(streams, start_s, session):
         (publishers[1], streams.child_s, streams.Ts_child, "camera"),
     ):
         rows += [
-            (time_s, publisher, T, frame) for time_s, T in zip(times_s, Ts, strict=True)
+            (time_s, publisher, T, frame)
+            for time_s, T in zip(times_s, Ts, strict=True)
         ]
     second = None
     for time_s, publisher, T, frame in sorted(rows, key=lambda row: row[0]):
@@ -794,10 +852,16 @@ def start_publishing(domain, streams, start_s, session):
 
 def row_of(witness, start_s, end_s, last, T_parent_child):
     """Return the row of the table: times of the first result and DONE, flips, last headline."""
-    during = [(t, state) for t, state in witness.states if start_s <= t <= end_s]
+    during = [
+        (t, state) for t, state in witness.states if start_s <= t <= end_s
+    ]
     first = next((t - start_s for t, state in during if state.result), math.nan)
     done = next(
-        (t - start_s for t, s in during if s.progress and s.progress.progress.done),
+        (
+            t - start_s
+            for t, s in during
+            if s.progress and s.progress.progress.done
+        ),
         math.nan,
     )
     verdicts = [state.result.verdict for _, state in during if state.result]
@@ -834,7 +898,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     names = ", ".join(SESSIONS)
     parser.add_argument(
-        "sessions", nargs="*", metavar="SESSION", help=f"all by default: {names}"
+        "sessions",
+        nargs="*",
+        metavar="SESSION",
+        help=f"all by default: {names}",
     )
     parser.add_argument(
         "--out", type=Path, help="directory for logs, pages and headlines"
@@ -852,12 +919,18 @@ def main():
                 continue
             folder = (scratch_or_out or Path(scratch)) / f"session_{number}"
             folder.mkdir(parents=True, exist_ok=True)
-            (row, witness), problems = run(name, SESSIONS[name], folder, SEED + number)
+            (row, witness), problems = run(
+                name, SESSIONS[name], folder, SEED + number
+            )
             rows.append([name, *row, str(len(problems))])
-            all_problems += [f"{name}, {second} s: {text}" for second, text in problems]
+            all_problems += [
+                f"{name}, {second} s: {text}" for second, text in problems
+            ]
             seen = dict.fromkeys(page.headline for _, page in witness.pages)
             (folder / "headlines.txt").write_text("\n".join(seen) + "\n")
-            lines = [json.dumps([at_s, page.html]) for at_s, page in witness.pages]
+            lines = [
+                json.dumps([at_s, page.html]) for at_s, page in witness.pages
+            ]
             (folder / "pages.jsonl").write_text("\n".join(lines) + "\n")
             print(name, row, *problems[:5], sep="\n   ", flush=True)
     show([Table("Live sessions", [*HEADINGS, "contradictions"], rows)])

@@ -57,7 +57,13 @@ def everything(is_full):
 def versions():
     """What the times depend on."""
     found = [f"python {platform.python_version()}", f"cores {os.cpu_count()}"]
-    for name in ("numpy", "scipy", "casadi", "rosbags", "opencv-python-headless"):
+    for name in (
+        "numpy",
+        "scipy",
+        "casadi",
+        "rosbags",
+        "opencv-python-headless",
+    ):
         try:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
@@ -76,7 +82,10 @@ def main(arguments=None):
         help="10^6 pairs, and the slow methods on 10^5 as well",
     )
     parser.add_argument(
-        "--page", type=Path, metavar="FILE", help="put the tables into this page"
+        "--page",
+        type=Path,
+        metavar="FILE",
+        help="put the tables into this page",
     )
     parser.add_argument(
         "--update",
@@ -91,14 +100,20 @@ def main(arguments=None):
     tables = table.tables(source, measured, memory)
     table.show(tables)
     if options.page:
-        typed = " ".join(["python benchmarks/run.py", *(arguments or sys.argv[1:])])
+        typed = " ".join(
+            ["python benchmarks/run.py", *(arguments or sys.argv[1:])]
+        )
         note = f"Measured by `OMP_NUM_THREADS=1 {typed}` with {versions()}.\n"
         table.write(tables, options.page, note)
     known = json.loads(BASELINE.read_text(encoding="utf-8"))
     ratios = baseline.ratios(measured, memory)
     if options.update:
-        known[source] = {name: float(f"{ratio:.2g}") for name, ratio in ratios.items()}
-        BASELINE.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
+        known[source] = {
+            name: float(f"{ratio:.2g}") for name, ratio in ratios.items()
+        }
+        BASELINE.write_text(
+            json.dumps(known, indent=2) + "\n", encoding="utf-8"
+        )
         return 0
     found = baseline.failures(measured, ratios, known[source])
     told = "\n".join(found) or f"all {len(measured)} rows within the baseline"

@@ -30,7 +30,11 @@ from node_sessions import Page  # noqa: E402
 from hand_eye_calib.online.watch import web  # noqa: E402
 
 PAGE_FILES = Path(web.__file__).parent / "page"
-MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".html": "text/html"}
+MEDIA_TYPES = {
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".html": "text/html",
+}
 
 # Height of the picture (pixels), and time for which a page is displayed (ms).
 HEIGHT = 800
@@ -90,7 +94,9 @@ def photographs(pages, width):
     """Yield a picture of each page."""
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Player)
     server.html = ""
-    server.handle_error = lambda *_: None  # the browser closes connections at any time
+    server.handle_error = lambda *_: (
+        None
+    )  # the browser closes connections at any time
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(folder)
@@ -117,7 +123,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("pages", type=Path, help="pages.jsonl of a session")
     parser.add_argument("target", type=Path, help="picture to write")
-    parser.add_argument("--headline", default="", help="beginning of the only headline")
+    parser.add_argument(
+        "--headline", default="", help="beginning of the only headline"
+    )
     parser.add_argument(
         "--width", type=int, default=390, help="pixels. Default: a phone"
     )
@@ -125,7 +133,9 @@ def main():
     pages = chosen_pages(arguments.pages)
     if arguments.headline:
         pages = [
-            page for page in pages if page.headline.startswith(arguments.headline)
+            page
+            for page in pages
+            if page.headline.startswith(arguments.headline)
         ][-1:]
     if not pages:
         parser.error(f"no headline begins with {arguments.headline!r}")

@@ -7,7 +7,12 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-FETCHED = {("img", "src"), ("script", "src"), ("link", "href"), ("iframe", "src")}
+FETCHED = {
+    ("img", "src"),
+    ("script", "src"),
+    ("link", "href"),
+    ("iframe", "src"),
+}
 
 
 class Page(HTMLParser):
@@ -25,7 +30,9 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attrs):
         """Collect what this tag links to."""
         given = dict(attrs)
-        self.anchors |= {given[name] for name in ("id", "name") if given.get(name)}
+        self.anchors |= {
+            given[name] for name in ("id", "name") if given.get(name)
+        }
         for name in ("href", "src"):
             if given.get(name):
                 self.links.append((tag, name, given[name]))
@@ -34,7 +41,8 @@ class Page(HTMLParser):
 def faults(site):
     """A line for each link that leads nowhere or fetches from elsewhere."""
     pages = {
-        path: Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")
+        path: Page(path.read_text(encoding="utf-8"))
+        for path in site.rglob("*.html")
     }
     for path, page in pages.items():
         for tag, name, target in page.links:
@@ -51,7 +59,9 @@ def faults(site):
             )
             if not found.exists():
                 yield f"{path.relative_to(site)}: no {target}"
-            elif found in pages and not pages[found].has(unquote(parts.fragment)):
+            elif found in pages and not pages[found].has(
+                unquote(parts.fragment)
+            ):
                 yield f"{path.relative_to(site)}: no place {target}"
 
 

@@ -17,10 +17,14 @@ LINKED_FILES = ("config/calibrator.yaml",)
 def on_files(files, config):
     """Add the files."""
     for name in (*ROOT_PAGES, *LINKED_FILES):
-        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+        files.append(
+            File.generated(config, name, abs_src_path=str(ROOT / name))
+        )
     for path in sorted((ROOT / "examples").glob("*.ipynb")):
         for name, content in notebook_files(path).items():
-            files.append(File.generated(config, f"examples/{name}", content=content))
+            files.append(
+                File.generated(config, f"examples/{name}", content=content)
+            )
     return files
 
 
@@ -30,7 +34,8 @@ def notebook_files(path):
     notebook = nbformat.read(path, as_version=4)
     text, resources = exporter.from_notebook_node(notebook)
     pictures = {
-        f"{path.stem}_{name}": data for name, data in resources["outputs"].items()
+        f"{path.stem}_{name}": data
+        for name, data in resources["outputs"].items()
     }
     for name in resources["outputs"]:
         text = text.replace(f"({name})", f"({path.stem}_{name})")
@@ -41,7 +46,9 @@ def notebook_files(path):
 def on_page_content(html, **_):
     """Roles of Sphinx in docstrings become plain names, empty headings of tables plain cells."""
     html = re.sub(r"<th[^>]*></th>", "<td></td>", html)
-    return re.sub(r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", html)
+    return re.sub(
+        r":\w+:<code>~?(?:[\w.]+\.)?(\w+)</code>", r"<code>\1</code>", html
+    )
 
 
 def on_page_markdown(markdown, page, config, **_):

@@ -12,7 +12,9 @@ def main(parent_file: str, child_file: str, directory: str) -> hec.Calibration:
     """Calibrate, print, save."""
     parent = hec.read_trajectory(parent_file, format="auto")
     child = hec.read_trajectory(child_file, format="auto")
-    result = hec.calibrate(parent, child, parent_frame="lidar", child_frame="camera")
+    result = hec.calibrate(
+        parent, child, parent_frame="lidar", child_frame="camera"
+    )
     print(result.headline)
     for reason in result.reasons:
         print(f"- {reason.sentence} {reason.what_to_do}")

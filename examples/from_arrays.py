@@ -19,7 +19,8 @@ def poses_of_a_lidar(times_s: np.ndarray) -> np.ndarray:
     """Poses (N, 4, 4) on a winding path over hills."""
     poses = np.tile(np.eye(4), (len(times_s), 1, 1))
     angles = np.stack(
-        [0.1 * np.sin(times_s), 0.1 * np.cos(1.3 * times_s), 0.5 * times_s], axis=1
+        [0.1 * np.sin(times_s), 0.1 * np.cos(1.3 * times_s), 0.5 * times_s],
+        axis=1,
     )
     poses[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
     poses[:, :3, 3] = np.stack(

@@ -49,7 +49,9 @@ def __getattr__(name: str) -> Any:
 
         return version_of()
     if name not in _MODULES:
-        raise AttributeError(f"module 'hand_eye_calib' has no attribute {name!r}")
+        raise AttributeError(
+            f"module 'hand_eye_calib' has no attribute {name!r}"
+        )
     return getattr(import_module(_MODULES[name]), name)
 
 

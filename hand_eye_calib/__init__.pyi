@@ -2,7 +2,9 @@
 
 from hand_eye_calib.core.assessment.comparison import compare as compare
 from hand_eye_calib.core.base.config import CalibratorConfig as CalibratorConfig
-from hand_eye_calib.core.base.errors import HandEyeCalibError as HandEyeCalibError
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError as HandEyeCalibError,
+)
 from hand_eye_calib.core.engine.calibrator import Calibrator as Calibrator
 from hand_eye_calib.core.geometry.trajectory import Trajectory as Trajectory
 from hand_eye_calib.core.results.calibration import Calibration as Calibration
@@ -10,7 +12,9 @@ from hand_eye_calib.core.results.reasons import Reason as Reason
 from hand_eye_calib.core.results.reasons import Verdict as Verdict
 from hand_eye_calib.core.results.records import Residuals as Residuals
 from hand_eye_calib.core.results.records import SolveStatus as SolveStatus
-from hand_eye_calib.extras.fleet.together import calibrate_many as calibrate_many
+from hand_eye_calib.extras.fleet.together import (
+    calibrate_many as calibrate_many,
+)
 from hand_eye_calib.extras.fleet.together import (
     calibrate_together as calibrate_together,
 )
@@ -23,14 +27,20 @@ from hand_eye_calib.extras.ground.tracks import (
 from hand_eye_calib.extras.ground.tracks import (
     gravity_from_attitude as gravity_from_attitude,
 )
-from hand_eye_calib.extras.ground.tracks import ground_from_clouds as ground_from_clouds
+from hand_eye_calib.extras.ground.tracks import (
+    ground_from_clouds as ground_from_clouds,
+)
 from hand_eye_calib.extras.rig.rig import RigCalibration as RigCalibration
 from hand_eye_calib.extras.rig.rig import calibrate_rig as calibrate_rig
 from hand_eye_calib.extras.simulation.drive import simulate as simulate
 from hand_eye_calib.extras.stops.calibrate import calibrate_arm as calibrate_arm
-from hand_eye_calib.extras.stops.calibrate import calibrate_stops as calibrate_stops
+from hand_eye_calib.extras.stops.calibrate import (
+    calibrate_stops as calibrate_stops,
+)
 from hand_eye_calib.extras.stops.robot_angles import robot_poses as robot_poses
-from hand_eye_calib.extras.stops.samples import read_arm_samples as read_arm_samples
+from hand_eye_calib.extras.stops.samples import (
+    read_arm_samples as read_arm_samples,
+)
 from hand_eye_calib.extras.vehicle.calibrate import (
     calibrate_vehicle as calibrate_vehicle,
 )

@@ -18,7 +18,11 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, other_names
+from hand_eye_calib.core.base.config import (
+    CalibratorConfig,
+    NodeConfig,
+    other_names,
+)
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import check_value, option_name
 
@@ -38,12 +42,19 @@ REMAPPED |= {"tf_topic": "/tf", "tf_static_topic": "/tf_static"}
 
 # Arguments that are no parameters of the node: name, default and description.
 ARGUMENTS = {
-    name: (topic, f"Topic in place of {topic}.") for name, topic in REMAPPED.items()
+    name: (topic, f"Topic in place of {topic}.")
+    for name, topic in REMAPPED.items()
 } | {
     "config_file": (str(CONFIG_FILE), "File with the node's parameters."),
     "name": ("calibrator", "Name of the node."),
-    "namespace": ("", "Namespace of the node; relative topics are looked for in it."),
-    "use_sim_time": ("", "true follows /clock, as with a bag played with --clock."),
+    "namespace": (
+        "",
+        "Namespace of the node; relative topics are looked for in it.",
+    ),
+    "use_sim_time": (
+        "",
+        "true follows /clock, as with a bag played with --clock.",
+    ),
     "log_level": ("", "Of this node: debug, info, warn, error or fatal."),
     "watch": (
         "false",
@@ -140,7 +151,8 @@ def recording(context: LaunchContext) -> list[ExecuteProcess]:
     topics += [f"{own_name}/{name}" for name in results]
     namespace = full_namespace(context)
     topics = [
-        name if name.startswith("/") else f"{namespace}/{name}" for name in topics
+        name if name.startswith("/") else f"{namespace}/{name}"
+        for name in topics
     ]
     topics.append("/diagnostics")
     command = ["ros2", "bag", "record", "-o", directory, *topics]
@@ -155,7 +167,9 @@ def calibrator(context: LaunchContext) -> list[Node]:
             value = value_of(text, field)
             # launch would read a text as YAML.
             if isinstance(value, str):
-                value = ParameterValue(LaunchConfiguration(name), value_type=str)
+                value = ParameterValue(
+                    LaunchConfiguration(name), value_type=str
+                )
             parameters[name] = value
     if argument(context, "use_sim_time"):
         parameters["use_sim_time"] = is_true(context, "use_sim_time")
@@ -168,7 +182,8 @@ def calibrator(context: LaunchContext) -> list[Node]:
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("config_file"), parameters],
             remappings=[
-                (old, LaunchConfiguration(name)) for name, old in REMAPPED.items()
+                (old, LaunchConfiguration(name))
+                for name, old in REMAPPED.items()
             ],
             ros_arguments=["--log-level", f"{logger_name(context)}:={level}"]
             if level
@@ -186,7 +201,9 @@ def generate_launch_description() -> LaunchDescription:
     }
     return LaunchDescription(
         [
-            DeclareLaunchArgument(name, default_value=default, description=description)
+            DeclareLaunchArgument(
+                name, default_value=default, description=description
+            )
             for name, (default, description) in arguments.items()
         ]
         + [

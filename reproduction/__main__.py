@@ -99,7 +99,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         "reproduction", f"{__doc__}\n{_EPILOG}", "of certificate and faults"
     )
     add = parser.add_argument
-    add("id", metavar="ID", choices=tuple(EXPERIMENTS), help=", ".join(EXPERIMENTS))
+    add(
+        "id",
+        metavar="ID",
+        choices=tuple(EXPERIMENTS),
+        help=", ".join(EXPERIMENTS),
+    )
     add(
         "--data",
         choices=("published", "simulated"),
@@ -151,7 +156,9 @@ def run(arguments: argparse.Namespace) -> int:
         )
         text = said(results, files)
         if arguments.page is not None:
-            page = (arguments.out / f"{arguments.id}.md").read_text(encoding="utf-8")
+            page = (arguments.out / f"{arguments.id}.md").read_text(
+                encoding="utf-8"
+            )
             put_into_page(arguments.page, arguments.id, page)
     print(text)
     return 0
@@ -186,15 +193,20 @@ def made(
             f"{identifier} is about the KITTI drives: use --data published"
         )
     if len(artefacts) < len(wanted):
-        note("what is about the KITTI drives is left out: it needs the published data")
+        note(
+            "what is about the KITTI drives is left out: it needs the published data"
+        )
     out.mkdir(parents=True, exist_ok=True)
-    todo = dict.fromkeys(cell for artefact in artefacts for cell in artefact.cells)
+    todo = dict.fromkeys(
+        cell for artefact in artefacts for cell in artefact.cells
+    )
     solved = in_parallel(solve_cell, [(source, cell) for cell in todo], jobs)
     results = Results(
         source, table_of([row for rows in solved for row in rows]), out, jobs
     )
     return results, {
-        artefact.name: artefact.write(artefact.name, results) for artefact in artefacts
+        artefact.name: artefact.write(artefact.name, results)
+        for artefact in artefacts
     }
 
 

@@ -97,11 +97,15 @@ def real_cases(folder: Path | None) -> Iterator[Case]:
 
 def _real_case(rig: Rig, parent: Any, child: Any) -> Case:
     assert rig.truth is not None
-    options = {name: value for name, value in rig.options.items() if name != "prior"}
+    options = {
+        name: value for name, value in rig.options.items() if name != "prior"
+    }
     snapshot = whole_snapshot(parent, child, options).resolved
     pairs = snapshot.pose_pairs
     pairs = pairs.child_scaled(settle_scale(pairs, snapshot.config.scale)[0])
-    family = next((family for family in _FAMILIES if family in rig.name), rig.name)
+    family = next(
+        (family for family in _FAMILIES if family in rig.name), rig.name
+    )
     is_clock_free = snapshot.time_offset is not None
     return Case(
         family, pairs, is_clock_free, rig.truth.T_parent_child, rig.truth.sigmas
@@ -156,7 +160,9 @@ def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
         return None
     deviations = deviation(solution.T_parent_child, case.T_parent_child)
     to_parent = np.kron(np.eye(2), solution.T_parent_child[:3, :3])
-    variances = np.diag(to_parent @ solution.cov_parent_child_in_child @ to_parent.T)
+    variances = np.diag(
+        to_parent @ solution.cov_parent_child_in_child @ to_parent.T
+    )
     is_known = np.isfinite(case.sigmas)
     known_sigmas = np.where(is_known, case.sigmas, 0.0)
     squares = np.where(is_known, deviations**2 + 0.25 * known_sigmas**2, 0.0)
@@ -208,7 +214,9 @@ def _row(
     """
     log_ratios: dict[str, list[FloatArray]] = {}
     are_inside: list[bool] = []
-    for case, result, reference in zip(cases, outcomes, references, strict=True):
+    for case, result, reference in zip(
+        cases, outcomes, references, strict=True
+    ):
         if reference is None or np.nanmax(reference.errors) < _ROUNDING:
             continue
         ratios = np.full(2, _RATIO_OF_FAILURE)
@@ -241,7 +249,9 @@ def main() -> None:
         default=10,
         help="recordings of each kind of platform",
     )
-    parser.add_argument("--seed", type=int, help="default: a new seed at every run")
+    parser.add_argument(
+        "--seed", type=int, help="default: a new seed at every run"
+    )
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
     cases = [

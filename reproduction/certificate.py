@@ -42,7 +42,9 @@ def write(name: str, results: Results) -> list[Path]:
         for level in LEVELS.get(dataset, (None,))
     ]
     proofs_of_levels = in_parallel(prove_level, tasks, results.jobs)
-    proofs = pd.DataFrame([proof for several in proofs_of_levels for proof in several])
+    proofs = pd.DataFrame(
+        [proof for several in proofs_of_levels for proof in several]
+    )
     table = proofs.groupby(["data sets", "answer"], sort=False).agg(
         **{
             "answers": ("proved", "size"),
@@ -90,7 +92,9 @@ def prove_level(
                 false = list(_false_minima(Q, solution.T_parent_child))
                 proofs.append(
                     {
-                        "data sets": "KITTI" if dataset in KITTI else "simulated",
+                        "data sets": "KITTI"
+                        if dataset in KITTI
+                        else "simulated",
                         "answer": answer,
                         "proved": is_proved,
                         "false": len(false),
@@ -105,14 +109,22 @@ def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
     for name in ("dnl", "dnlo"):
         yield name, Method(name).solve(pairs)
     park = Method("park").solve(pairs)
-    Q = quadratic_form.weighted_sum(quadratic_form.coefficients(pairs), park.weights)
+    Q = quadratic_form.weighted_sum(
+        quadratic_form.coefficients(pairs), park.weights
+    )
     Ts, *_ = quadratic_form.minimise(Q, park.T_parent_child[None, :3, :3])
     yield "dnl from park", replace(park, T_parent_child=Ts[0])
 
 
-def _false_minima(Q: FloatArray, T_parent_child: FloatArray) -> Iterator[FloatArray]:
-    value = float(quadratic_form.minimise(Q, T_parent_child[None, :3, :3])[1][0])
-    Ts, values, _ = quadratic_form.minimise(Q, T_parent_child[:3, :3] @ _HALF_TURNS)
+def _false_minima(
+    Q: FloatArray, T_parent_child: FloatArray
+) -> Iterator[FloatArray]:
+    value = float(
+        quadratic_form.minimise(Q, T_parent_child[None, :3, :3])[1][0]
+    )
+    Ts, values, _ = quadratic_form.minimise(
+        Q, T_parent_child[:3, :3] @ _HALF_TURNS
+    )
     for T, other in zip(Ts, values, strict=True):
         if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
             yield T

@@ -31,7 +31,9 @@ def posed(stream: Trajectory, poses: FloatArray) -> Trajectory:
     return dataclasses.replace(stream, poses=poses)
 
 
-def moved_at(stream: Trajectory, where: Any, transforms: FloatArray) -> Trajectory:
+def moved_at(
+    stream: Trajectory, where: Any, transforms: FloatArray
+) -> Trajectory:
     """The stream with some of its poses multiplied from the right."""
     poses = stream.poses.copy()
     poses[where] = poses[where] @ transforms

@@ -12,7 +12,10 @@ from typing import Any
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.extras.simulation.drive import SimulatedDrive, simulate_drive
+from hand_eye_calib.extras.simulation.drive import (
+    SimulatedDrive,
+    simulate_drive,
+)
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.coverage.classes import CLASSES, Simulated, make
 from reproduction.recordings import Rig, real_rigs
@@ -48,7 +51,9 @@ class Clean:
 
 def names(folder: Path | None) -> list[str]:
     """Names of all clean recordings."""
-    simulated = [f"{kind} {seed}" for kind in (*CLASSES, *_HILLY) for seed in SEEDS]
+    simulated = [
+        f"{kind} {seed}" for kind in (*CLASSES, *_HILLY) for seed in SEEDS
+    ]
     return simulated + list(_real(folder))
 
 

@@ -85,5 +85,7 @@ def reasons(rows: pd.DataFrame) -> str:
     whys = rows["why"]
     is_explained = ~rows["agrees"] & (whys != "")
     counts = whys[is_explained].value_counts()
-    words = [f"{count} of {len(rows)} rows: {why}" for why, count in counts.items()]
+    words = [
+        f"{count} of {len(rows)} rows: {why}" for why, count in counts.items()
+    ]
     return "; ".join(words)

@@ -39,7 +39,8 @@ class Shown:
     def dnlo(self, dataset: str, metric: str = "e_at") -> dict[str, float]:
         """Scores of DNLO by reference."""
         return {
-            name: self.table.score(dataset, "dnlo", name, metric) for name in REFERENCES
+            name: self.table.score(dataset, "dnlo", name, metric)
+            for name in REFERENCES
         }
 
     @cached_property
@@ -64,7 +65,9 @@ class Shown:
         """Mean e_at with the largest drift: of reference A, and of the other references."""
         means = []
         for reference in REFERENCES:
-            summary = self.table.summary("drift", 0.05, method, reference, "e_at")
+            summary = self.table.summary(
+                "drift", 0.05, method, reference, "e_at"
+            )
             means.append(summary.centre)
         first, *others = means
         return first, others
@@ -168,7 +171,9 @@ def _first_pose(shown: Shown) -> Judgement:
         a, *others = shown.dnlo(dataset).values()
         ratio[dataset] = a / min(others)
     is_worse = ratio["outliers"] > 2 and ratio["drift"] > 2
-    evidence = f"e_at of A over that of the best other: {_listed(ratio, '.1f')}."
+    evidence = (
+        f"e_at of A over that of the best other: {_listed(ratio, '.1f')}."
+    )
     return Judgement(is_worse and ratio["noise"] > 1, evidence)
 
 
@@ -185,7 +190,8 @@ def _smallest_motions_first(shown: Shown) -> Judgement:
         by_steps = [name for name in order if not name.startswith("C")]
         by_distance = [name for name in order if name.startswith("C")]
         are_monotone.append(
-            by_steps == ["B1", "B5", "B10", "A"] and by_distance == ["C5", "C10"]
+            by_steps == ["B1", "B5", "B10", "A"]
+            and by_distance == ["C5", "C10"]
         )
         are_first.append(order[0] == "B1")
         evidence.append(f"{dataset}: {' < '.join(order)}")
@@ -204,7 +210,9 @@ def _drift_of_dnlo(shown: Shown) -> Judgement:
     largest = max(others)
     spread = largest / smallest
     of_a = first / smallest
-    evidence = f"At 0.05: factor {spread:.2f} among the others, A {of_a:.1f} times."
+    evidence = (
+        f"At 0.05: factor {spread:.2f} among the others, A {of_a:.1f} times."
+    )
     return Judgement(spread < 2 and first > 3 * largest, evidence)
 
 
@@ -214,13 +222,13 @@ def _components(shown: Shown) -> Judgement:
     spreads = components(shown.results.source.cases("noise", 0.0))
     medians = []
     for name in ("x", "y", "z", "roll", "pitch", "yaw"):
-        medians.append([spreads[name][reference].centre for reference in REFERENCES])
+        medians.append(
+            [spreads[name][reference].centre for reference in REFERENCES]
+        )
     x, y, z, roll, pitch, yaw = np.array(medians)
     height = np.max(z / np.minimum(x, y))
     tilt = np.max(np.maximum(roll, pitch) / yaw)
-    evidence = (
-        f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
-    )
+    evidence = f"Medians: z at most {height:.2f} of x and y, roll and pitch {tilt:.2f} of yaw."
     return Judgement(height < 0.5 and tilt < 0.5, evidence)
 
 
@@ -262,7 +270,9 @@ def _no_criterion(shown: Shown) -> Judgement:
 def _best_with_noise(shown: Shown) -> Judgement:
     """With Gaussian noise B10 is the best variant of all methods but Zhuang (4.2.2)."""
     best = shown.best["noise"]
-    by_b10 = {method for method, reference in best.items() if reference == "B10"}
+    by_b10 = {
+        method for method, reference in best.items() if reference == "B10"
+    }
     return Judgement(by_b10 == set(best) - {"zhuang"}, f"{_listed(best)}.")
 
 
@@ -325,7 +335,9 @@ def _drift_of_all(shown: Shown) -> Judgement:
     for method in _AS_PUBLISHED:
         _, others = shown.drift(method)
         factors[method] = max(others) / min(others)
-    evidence = f"At 0.05, worst of the others over best: {_listed(factors, '.1f')}."
+    evidence = (
+        f"At 0.05, worst of the others over best: {_listed(factors, '.1f')}."
+    )
     in_part = min(factors.values()) < 2
     return Judgement(max(factors.values()) < 2, evidence, in_part)
 
@@ -335,7 +347,9 @@ def _best_with_mixture(shown: Shown) -> Judgement:
     """With mixed noise B5 is the best variant of all methods (4.2.2)."""
     best = shown.best["mixture"]
     references = set(best.values())
-    return Judgement(references == {"B5"}, f"{_listed(best)}.", "B5" in references)
+    return Judgement(
+        references == {"B5"}, f"{_listed(best)}.", "B5" in references
+    )
 
 
 @RULES.append
@@ -439,11 +453,15 @@ def _errors_of_variants(shown: Shown, dataset: str) -> FloatArray:
     """Scores e_at (methods, references) of a data set."""
     if dataset in KITTI:
         column = shown.drives[dataset][_AT]
-        rows = [[column[method][name] for name in REFERENCES] for method in METHODS]
+        rows = [
+            [column[method][name] for name in REFERENCES] for method in METHODS
+        ]
         return np.array(rows)
     rows = []
     for method in _AS_PUBLISHED:
-        rows.append([shown.table.score(dataset, method, name) for name in REFERENCES])
+        rows.append(
+            [shown.table.score(dataset, method, name) for name in REFERENCES]
+        )
     return np.array(rows)
 
 

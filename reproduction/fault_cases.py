@@ -25,7 +25,14 @@ from reproduction.changed_streams import (
     with_parts,
     with_quats,
 )
-from reproduction.fault_entry import SECONDS, THREE, Streams, both, child_alone, group
+from reproduction.fault_entry import (
+    SECONDS,
+    THREE,
+    Streams,
+    both,
+    child_alone,
+    group,
+)
 
 _POSITIONS = "smoothed_positions position_clock"
 

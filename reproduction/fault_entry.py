@@ -46,7 +46,9 @@ def both(
 
     def enter(damage: _OfBoth) -> _OfBoth:
         names = frozenset(named.split())
-        _ENTERED.append(Fault(code, what, severities, unit, damage, names, options))
+        _ENTERED.append(
+            Fault(code, what, severities, unit, damage, names, options)
+        )
         return damage
 
     return enter

@@ -61,7 +61,14 @@ _FAULTS = {fault.code: fault for fault in chain(*GROUPS.values())}
 
 # Rules of the verdict that state how a recording is, not that something is wrong.
 _PHYSICAL = frozenset(
-    {"unobservable", "nothing_known", "target", "floor", "outliers", "warning_finding"}
+    {
+        "unobservable",
+        "nothing_known",
+        "target",
+        "floor",
+        "outliers",
+        "warning_finding",
+    }
     | {"error_finding"}
 )
 
@@ -106,7 +113,11 @@ def run(arguments: argparse.Namespace) -> str:
     """
     folder = arguments.data_folder
     out = arguments.out
-    todo = clean_cases(folder) if arguments.clean else cases(folder, arguments.seed)
+    todo = (
+        clean_cases(folder)
+        if arguments.clean
+        else cases(folder, arguments.seed)
+    )
     tasks = {case.key: (case, folder) for case in todo}
     records = kept(out / "faults.jsonl", _plain_outcome, tasks, arguments.jobs)
     text = report([Outcome(**record) for record in records.values()], folder)
@@ -408,7 +419,9 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     groups = _clean_groups(outcomes, folder)
     n_wrong = sum(len(group.wrong_codes) for group in groups.values())
     n_own = sum(_is_physical(outcome) for outcome in outcomes)
-    rows = [group.row(kind) for kind, group in groups.items() if group.is_listed()]
+    rows = [
+        group.row(kind) for kind, group in groups.items() if group.is_listed()
+    ]
     return (
         f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "
         f"method. {n_own} of {len(outcomes)} results are called USE or have reasons that the "

@@ -23,7 +23,15 @@ Choice = tuple[str, str, str]
 
 FIGURE_METHODS = {
     "fig3": ("dnlo",),
-    "fig5": (ALI_AS_PUBLISHED, "ali", "dnl", "dnlo", "park", "taylor", "zhuang"),
+    "fig5": (
+        ALI_AS_PUBLISHED,
+        "ali",
+        "dnl",
+        "dnlo",
+        "park",
+        "taylor",
+        "zhuang",
+    ),
     "figS1": (ALI_AS_PUBLISHED,),
     "figS1_proper": ("ali",),
     "figS2": ("dnl",),
@@ -44,7 +52,9 @@ def write_error_figure(name: str, results: Results) -> list[Path]:
     table = results.ours
     methods = FIGURE_METHODS[name]
     choices = [
-        choice for dataset in SIMULATED for choice in _choices(dataset, methods, table)
+        choice
+        for dataset in SIMULATED
+        for choice in _choices(dataset, methods, table)
     ]
     numbers = _numbers(choices, table)
     paths = [
@@ -56,14 +66,17 @@ def write_error_figure(name: str, results: Results) -> list[Path]:
     return paths
 
 
-def _choices(dataset: str, methods: Sequence[str], table: Table) -> list[Choice]:
+def _choices(
+    dataset: str, methods: Sequence[str], table: Table
+) -> list[Choice]:
     """(dataset, method, reference) shown: every reference of a single method, else the best of
     each.
     """
     if len(methods) == 1:
         return [(dataset, methods[0], reference) for reference in REFERENCES]
     return [
-        (dataset, method, table.best_reference(dataset, method)) for method in methods
+        (dataset, method, table.best_reference(dataset, method))
+        for method in methods
     ]
 
 
@@ -72,7 +85,11 @@ def _numbers(choices: Sequence[Choice], table: Table) -> pd.DataFrame:
     return pd.DataFrame(
         {
             **dict(
-                zip(_POINT, (dataset, level, method, reference, metric), strict=True)
+                zip(
+                    _POINT,
+                    (dataset, level, method, reference, metric),
+                    strict=True,
+                )
             ),
             "statistic": "mean" if dataset != "mixture" else "median",
             "centre": found.centre,
@@ -117,7 +134,11 @@ def _titles(name: str, results: Results) -> tuple[str, str]:
 
 
 def _draw(
-    title: str, note: str, choices: Sequence[Choice], results: Results, stem: Path
+    title: str,
+    note: str,
+    choices: Sequence[Choice],
+    results: Results,
+    stem: Path,
 ) -> list[Path]:
     panels: dict[tuple[str, str], list[Line]] = {}
     one_method = len({method for _, method, _ in choices}) == 1
@@ -130,10 +151,14 @@ def _draw(
             line = Line(
                 label=reference if one_method else short,
                 name="" if one_method else f"{names} {reference}",
-                look=REFERENCE_LOOKS[reference] if one_method else METHOD_LOOKS[method],
+                look=REFERENCE_LOOKS[reference]
+                if one_method
+                else METHOD_LOOKS[method],
                 levels=tuple(level for level in levels if level is not None),
                 summaries=tuple(
-                    results.ours.summary(dataset, level, method, reference, metric)
+                    results.ours.summary(
+                        dataset, level, method, reference, metric
+                    )
                     for level in levels
                 ),
             )
@@ -164,16 +189,19 @@ def _coinciding(
 
 
 def _compare(
-    name: str, numbers: pd.DataFrame, choices: Sequence[Choice], results: Results
+    name: str,
+    numbers: pd.DataFrame,
+    choices: Sequence[Choice],
+    results: Results,
 ) -> list[Path]:
     compared = numbers.copy()
     theirs = _numbers(choices, results.theirs)
     parts = ["centre", "low", "high"]
     published = [f"published_{statistic}" for statistic in parts]
     compared[published] = theirs[parts]
-    compared["agrees"] = agree(numbers[parts].to_numpy(), theirs[parts].to_numpy()).all(
-        axis=1
-    )
+    compared["agrees"] = agree(
+        numbers[parts].to_numpy(), theirs[parts].to_numpy()
+    ).all(axis=1)
     rows = dict(list(results.rows.groupby(["dataset", "method", "reference"])))
     whys = []
     for point in compared.itertuples():
@@ -186,10 +214,14 @@ def _compare(
         .between(others["published_low"], others["published_high"])
         .sum()
     )
-    keys = pd.MultiIndex.from_frame(results.rows[["dataset", "method", "reference"]])
+    keys = pd.MultiIndex.from_frame(
+        results.rows[["dataset", "method", "reference"]]
+    )
     shown = results.rows[keys.isin(pd.MultiIndex.from_tuples(choices))]
     return [
-        write_csv(results.out / f"{name}_comparison.csv", compared.assign(why=whys)),
+        write_csv(
+            results.out / f"{name}_comparison.csv", compared.assign(why=whys)
+        ),
         write_text(
             results.out / f"{name}_comparison.md",
             f"# {name}: comparison with the published results",
@@ -198,7 +230,9 @@ def _compare(
             "within the published interval.",
             "## Row by row",
             comparison.describe_rows(shown),
-            comparison.describe_dnlo(shown) if "dnlo" in FIGURE_METHODS[name] else "",
+            comparison.describe_dnlo(shown)
+            if "dnlo" in FIGURE_METHODS[name]
+            else "",
         ),
     ]
 
@@ -227,7 +261,10 @@ def write_components(name: str, results: Results) -> list[Path]:
             f"{number}. Components of the relative motions of {where} without noise",
             "Median, quartiles, whiskers to 1.5 interquartile ranges. Of the parent sensor; "
             "angles are ZYX Euler angles.",
-            {f"|{component}|": summaries[component] for component in _COMPONENTS},
+            {
+                f"|{component}|": summaries[component]
+                for component in _COMPONENTS
+            },
             results.out / name,
         ),
         write_csv(results.out / f"{name}.csv", table),
@@ -245,9 +282,9 @@ def components(cases: Sequence[Case]) -> dict[str, dict[str, Summary]]:
         motions = np.concatenate(
             [case.pairs(reference).Ts_parenti_parentj for case in cases]
         )
-        angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler("ZYX", degrees=True)[
-            :, ::-1
-        ]
+        angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler(
+            "ZYX", degrees=True
+        )[:, ::-1]
         values = np.abs(np.hstack([motions[:, :3, 3], angles])).T
         for component, of_component in zip(_COMPONENTS, values, strict=True):
             summaries[component][reference] = quartile_summary(of_component)

@@ -46,7 +46,9 @@ def _ali(table: Table) -> str:
                 f"{metric}, {title}": f"{np.median(values):.4g}"
                 for metric in ("e_at", "e_aR")
                 for title, method in methods.items()
-                for values in [table.values(dataset, level, method, reference, metric)]
+                for values in [
+                    table.values(dataset, level, method, reference, metric)
+                ]
             }
             for reference in REFERENCES
         ]
@@ -56,7 +58,9 @@ def _ali(table: Table) -> str:
 
 
 def _zhuang(rows: pd.DataFrame) -> str:
-    chosen = rows[(rows["method"] == "zhuang") & rows["dataset"].isin(SIMULATED)]
+    chosen = rows[
+        (rows["method"] == "zhuang") & rows["dataset"].isin(SIMULATED)
+    ]
     wrong = chosen[chosen["published_e_aR"] > _WRONG_DEG]
     free = wrong[wrong["level"] == 0.0]
     return (

@@ -11,7 +11,10 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from hand_eye_calib.core.assessment.common_mode import common_mode_floor, usual_speed
+from hand_eye_calib.core.assessment.common_mode import (
+    common_mode_floor,
+    usual_speed,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
 from reproduction.coverage.scores import answer
@@ -51,7 +54,9 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
             "truth": case.sigmas[k] ** 2,
             "stated": stated[k],
             "whole": whole[k],
-            "rest": max(whole[k] - stated[k] - common_mode_floor(speed_m_s)[k, k], 0.0),
+            "rest": max(
+                whole[k] - stated[k] - common_mode_floor(speed_m_s)[k, k], 0.0
+            ),
         }
 
 
@@ -78,7 +83,9 @@ def chosen(axis_rows: pd.DataFrame) -> tuple[float, float, float]:
     return min(product(*_SIZES), key=loss)
 
 
-def _row(name: str, axis_rows: pd.DataFrame, sizes: str = "") -> dict[str, object]:
+def _row(
+    name: str, axis_rows: pd.DataFrame, sizes: str = ""
+) -> dict[str, object]:
     far = np.abs(axis_rows["error"])
     row: dict[str, object] = {
         "Family": name,
@@ -94,8 +101,12 @@ def _row(name: str, axis_rows: pd.DataFrame, sizes: str = "") -> dict[str, objec
             far < _REACH * np.sqrt(axis_rows[of] + more)
             for more in (axis_rows["truth"], 0.0)
         ]
-        row[title] = ", ".join(f"{100 * np.mean(shares):.0f} %" for shares in inside)
-    floor = np.sqrt(axis_rows["whole"] - axis_rows["stated"])[~axis_rows["turns"]]
+        row[title] = ", ".join(
+            f"{100 * np.mean(shares):.0f} %" for shares in inside
+        )
+    floor = np.sqrt(axis_rows["whole"] - axis_rows["stated"])[
+        ~axis_rows["turns"]
+    ]
     largest = (far / np.sqrt(axis_rows["whole"] + axis_rows["truth"])).max()
     return row | {
         "Mean floor (mm)": f"{1e3 * floor.mean():.1f}",
@@ -109,10 +120,10 @@ def table(axis_rows: pd.DataFrame) -> str:
     for family in axis_rows["family"].unique():
         is_left_out = axis_rows["family"] == family
         metres, radians, travel_s = sizes = chosen(axis_rows[~is_left_out])
-        axis_rows.loc[is_left_out, "then"] = _variances(axis_rows[is_left_out], sizes)
-        words = (
-            f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
+        axis_rows.loc[is_left_out, "then"] = _variances(
+            axis_rows[is_left_out], sizes
         )
+        words = f"{1e3 * metres:g} mm, {np.degrees(radians):.2f} deg, {1e3 * travel_s:g} ms"
         rows.append(_row(family, axis_rows[is_left_out], words))
     return markdown_table([*rows, _row("all", axis_rows)])
 
@@ -129,7 +140,9 @@ def main() -> None:
     )
     seed = seed_of(None)
     asked = ("time_offset", "scale", "prior")
-    cases = real_cases(folder, arguments.pieces, np.random.default_rng(seed), asked)
+    cases = real_cases(
+        folder, arguments.pieces, np.random.default_rng(seed), asked
+    )
     axis_rows = pd.DataFrame([row for case in cases for row in axes(case)])
     show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(axis_rows)}"})
 

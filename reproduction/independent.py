@@ -175,7 +175,9 @@ def ethz(folder: Path) -> Iterator[Row]:
 
 def camodocal(folder: Path) -> Iterator[Row]:
     """The example of handeye_calib_camodocal: motions between neighbours."""
-    path = folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
+    path = (
+        folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
+    )
     samples = read_arm_samples(path)
     A = samples.robot
     B = samples.tracking
@@ -250,7 +252,9 @@ def wise(folder: Path) -> Iterator[Row]:
             Zs = np.array([fit.T_world_world for fit in fits])
             chi2.append(_chi_square_per_degree(Zs, weights, covariance))
 
-    ours = f"{seconds:.1f} s, sigma {min(sigmas_mm):.1f}-{max(sigmas_mm):.1f} mm"
+    ours = (
+        f"{seconds:.1f} s, sigma {min(sigmas_mm):.1f}-{max(sigmas_mm):.1f} mm"
+    )
     figure = f"{n_stops} stops, {len(fits_of_camera)} cameras: mean of the poses from their tags"
     source = f"{len(files)} pairs of files"
     yield Row("Wise et al.", figure, ours, "none readable", source)
@@ -269,7 +273,9 @@ def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
     """Navigation system and lidar of the farm robot."""
     files = folder / "independent" / "shrimp"
     return tuple(
-        _shrimp_trajectory(files / f"Shrimp{name}Data.mat", f"{name.lower()}Data")
+        _shrimp_trajectory(
+            files / f"Shrimp{name}Data.mat", f"{name.lower()}Data"
+        )
         for name in ("Nav", "Vel")
     )
 
@@ -297,13 +303,24 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
             result = hec.calibrate(*pair)
             relative = se3.inverse(truth) @ result.T_parent_child
             errors.append(
-                np.r_[relative[:3, 3], np.degrees(se3.rotation_log(relative[:3, :3]))]
+                np.r_[
+                    relative[:3, 3],
+                    np.degrees(se3.rotation_log(relative[:3, :3])),
+                ]
             )
-            covariances = np.array([result.covariance, result.covariance_measured])
-            stated.append(_SHRIMP_UNITS * np.sqrt(np.diagonal(covariances, 0, 1, 2)))
+            covariances = np.array(
+                [result.covariance, result.covariance_measured]
+            )
+            stated.append(
+                _SHRIMP_UNITS * np.sqrt(np.diagonal(covariances, 0, 1, 2))
+            )
             verdicts.append(result.verdict.value)
-        ours = " ".join(f"{value:.3f}" for value in np.mean(np.abs(errors), axis=0))
-        off = np.abs(np.stack([errors, errors - np.median(errors, axis=0)], axis=1))
+        ours = " ".join(
+            f"{value:.3f}" for value in np.mean(np.abs(errors), axis=0)
+        )
+        off = np.abs(
+            np.stack([errors, errors - np.median(errors, axis=0)], axis=1)
+        )
         covers = np.mean(off < 1.645 * np.array(stated), axis=(0, 2))
         yield Row(
             "Shrimp",
@@ -318,7 +335,9 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
 
 
 def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
-    data: Any = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)[name]
+    data: Any = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)[
+        name
+    ]
     steps = np.asarray(data.T_Skm1_Sk, dtype=float)
     rotations = se3.rotation_exp(steps[:, 3:])
     moved = se3.inverse(se3.from_rotation_translation(rotations, steps[:, :3]))

@@ -63,14 +63,18 @@ def solve_ours(sequence: Any) -> hec.Calibration:
         options["scale"] = "estimate"
     if sequence.manifest["sampling_mode"] == "stations":
         robot, camera = sequence.axyb_poses()
-        return hec.calibrate_stops(robot, camera, hec.CalibratorConfig(**options))
+        return hec.calibrate_stops(
+            robot, camera, hec.CalibratorConfig(**options)
+        )
     is_measured = sequence.camera.has_measurement
     camera = sequence.camera.T_cam_target_meas[is_measured]
     if sequence.eye_in_hand:
         camera = se3.inverse(camera)
     parent = _trajectory(sequence.robot.t, sequence.robot.T_base_ee_meas)
     child = _trajectory(sequence.camera.t[is_measured], camera)
-    return hec.calibrate(parent, child, time_offset=-sequence.time_offset, **options)
+    return hec.calibrate(
+        parent, child, time_offset=-sequence.time_offset, **options
+    )
 
 
 def _trajectory(seconds: FloatArray, poses: FloatArray) -> hec.Trajectory:
@@ -102,7 +106,9 @@ def results_of(data: Path) -> pd.DataFrame:
         except hec.HandEyeCalibError as error:
             print(f"{sequence.id}: {error}")
             continue
-        shared = {name: sequence.manifest[name] for name in ("sequence_id", "track")}
+        shared = {
+            name: sequence.manifest[name] for name in ("sequence_id", "track")
+        }
         shared["kind"] = "stops"
         if sequence.manifest["sampling_mode"] != "stations":
             shared["kind"] = "continuous"

@@ -20,7 +20,14 @@ from reproduction.changed_streams import (
     with_parts,
 )
 from reproduction.fault_cases import late_positions, loosened
-from reproduction.fault_entry import SECONDS, THREE, Streams, both, child_alone, group
+from reproduction.fault_entry import (
+    SECONDS,
+    THREE,
+    Streams,
+    both,
+    child_alone,
+    group,
+)
 
 # Time between two world jumps, and between the stamps of poses that arrive together (s).
 _BETWEEN_JUMPS_S = 20.0
@@ -314,7 +321,9 @@ def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
     unit="deg",
     named="worlds_turned",
 )
-def turned_positions(stream: Trajectory, degrees: float, _: Random) -> Trajectory:
+def turned_positions(
+    stream: Trajectory, degrees: float, _: Random
+) -> Trajectory:
     """Positions in a world that is turned about z against that of the orientations."""
     turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return with_parts(stream, positions=positions_of(stream) @ turn.T)
@@ -326,7 +335,12 @@ both(
     severities=(1.5, 2.5, 4.0),
     unit="deg",
     named="worlds_turned",
-)(lambda parent, child, degrees, _: (turned_positions(parent, degrees, _), child))
+)(
+    lambda parent, child, degrees, _: (
+        turned_positions(parent, degrees, _),
+        child,
+    )
+)
 
 child_alone(
     code="X3",

@@ -65,7 +65,15 @@ COURSES = ("eights", "wide", "straight", "circle", "bend", "left", "spin")
 #: Kinds of wheel data of the machines, and further machines: ``mecanum`` has the odometry of four
 #: mecanum wheels. Two have data that no model describes: ``skid`` has tracks that slip more in
 #: tight curves, and ``articulated`` has the angle of its joint as steering angle.
-MACHINES = ("wheels", "steering", "tricycle", "omni", "mecanum", "skid", "articulated")
+MACHINES = (
+    "wheels",
+    "steering",
+    "tricycle",
+    "omni",
+    "mecanum",
+    "skid",
+    "articulated",
+)
 _DATA = {"mecanum": "omni", "skid": "wheels", "articulated": "steering"}
 
 # Sum of half the wheelbase and half the track of a machine with mecanum wheels (m).
@@ -94,7 +102,9 @@ def simulate_machine(
     driven = _course(course, machine, rng, times_s)
     Ts_world_base = _poses(rng, driven, noise, ramp_rad)
     n_wheels = 4 if machine == "mecanum" else 2
-    slips = _slip_of_wheels(rng, driven.yaw_rate, slip * noise * duration_s, n_wheels)
+    slips = _slip_of_wheels(
+        rng, driven.yaw_rate, slip * noise * duration_s, n_wheels
+    )
     parameters, rates = _wheels(machine, rng, driven, 1.0 + slips)
 
     stride = round(_WHEELS_S / _STEP_S)
@@ -205,7 +215,10 @@ def _poses(
 
 
 def _slip_of_wheels(
-    rng: np.random.Generator, yaw_rate: FloatArray, slipping_s: float, n_wheels: int
+    rng: np.random.Generator,
+    yaw_rate: FloatArray,
+    slipping_s: float,
+    n_wheels: int,
 ) -> FloatArray:
     """Return the share (N, n_wheels) by which wheels turn too fast: bursts in curves."""
     n_rows = len(yaw_rate)
@@ -297,7 +310,9 @@ def _mount(rng: np.random.Generator) -> FloatArray:
     return se3.from_rotation_translation(rotation, [x, y, z])
 
 
-def _measured(rng: np.random.Generator, poses: FloatArray, noise: float) -> FloatArray:
+def _measured(
+    rng: np.random.Generator, poses: FloatArray, noise: float
+) -> FloatArray:
     """Return poses with drift, 4 mm and 0.06 deg of noise."""
     drift_sigmas = np.repeat([0.0007, 0.0001], 3)
     white_sigmas = np.repeat([0.004, 0.001], 3)

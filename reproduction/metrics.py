@@ -22,7 +22,9 @@ class Errors(NamedTuple):
 
 
 def errors(
-    pairs: MotionPairs, T_parent_child: FloatArray, truth_T_parent_child: FloatArray
+    pairs: MotionPairs,
+    T_parent_child: FloatArray,
+    truth_T_parent_child: FloatArray,
 ) -> Errors:
     """All four metrics of a calibration."""
     return Errors(

@@ -39,7 +39,9 @@ _SMALL = (
 )
 _WHITE = dict.fromkeys(("figure_facecolor", "savefig_facecolor"), "white")
 _STYLE = (
-    dict.fromkeys(_SMALL, 7.0) | _WHITE | {"savefig_dpi": 200, "lines_linewidth": 1.1}
+    dict.fromkeys(_SMALL, 7.0)
+    | _WHITE
+    | {"savefig_dpi": 200, "lines_linewidth": 1.1}
 )
 
 REFERENCE_LOOKS = {
@@ -87,7 +89,12 @@ _LABEL_ROOM = 0.12
 _LETTER = 0.075
 
 _SMALL_BOLD: dict[str, Any] = {"fontweight": "bold", "fontsize": 6.2}
-_BARS: dict[str, Any] = {"elinewidth": 0.7, "capsize": 1.2, "capthick": 0.7, "mew": 0.8}
+_BARS: dict[str, Any] = {
+    "elinewidth": 0.7,
+    "capsize": 1.2,
+    "capthick": 0.7,
+    "mew": 0.8,
+}
 _LEGEND: dict[str, Any] = {
     "loc": "center left",
     "bbox_to_anchor": (1.0, 0.5),
@@ -117,7 +124,10 @@ class Line:
 
 
 def draw_errors(
-    title: str, note: str, panels: Mapping[tuple[str, str], Sequence[Line]], stem: Path
+    title: str,
+    note: str,
+    panels: Mapping[tuple[str, str], Sequence[Line]],
+    stem: Path,
 ) -> list[Path]:
     """Draw errors of several references or methods; return the paths of the files.
 
@@ -137,12 +147,16 @@ def draw_errors(
                 ax.set_xlabel(level_title)
             row[0].set_ylabel(dataset_title, fontweight="bold", fontsize=8)
             _add_legend(row[-1], panels[dataset, "e_at"])
-        for ax, metric_title in zip(axes[0], METRIC_TITLES.values(), strict=True):
+        for ax, metric_title in zip(
+            axes[0], METRIC_TITLES.values(), strict=True
+        ):
             ax.set_title(metric_title, fontsize=6.8)
         return _save(figure, stem)
 
 
-def _draw_panel(ax: Axes, dataset: str, metric: str, lines: Sequence[Line]) -> None:
+def _draw_panel(
+    ax: Axes, dataset: str, metric: str, lines: Sequence[Line]
+) -> None:
     """Draw the errors of a data set by a metric."""
     _scale(ax, lines, metric)
     if dataset == "mixture":
@@ -172,7 +186,9 @@ def _new_page(height: float, title: str, note: str) -> Figure:
 
 
 def _handle(label: str, colour: str, marker: str, dashes: str) -> Line2D:
-    return Line2D([], [], color=colour, marker=marker, ls=dashes, mew=0.8, label=label)
+    return Line2D(
+        [], [], color=colour, marker=marker, ls=dashes, mew=0.8, label=label
+    )
 
 
 def _save(figure: Figure, stem: Path) -> list[Path]:
@@ -221,7 +237,14 @@ def _draw_lines(ax: Axes, lines: Sequence[Line]) -> None:
         _draw_line(ax, line, shift)
     largest = max(summary.high for line in lines for summary in line.summaries)
     if largest < _ZERO:
-        ax.text(0.5, 0.5, "all zero", transform=ax.transAxes, ha="center", color=_GREY)
+        ax.text(
+            0.5,
+            0.5,
+            "all zero",
+            transform=ax.transAxes,
+            ha="center",
+            color=_GREY,
+        )
         ax.set_ylim(0.0, 1.0)
     else:
         ax.set_ylim(0.0, None)
@@ -261,11 +284,18 @@ def _label_ends(ax: Axes, lines: Sequence[Line], span: float) -> None:
     label_heights = _moved_apart(heights)
     right, _ = to_axes.transform((last + 0.04 * span, 0.0))
     label_start, _ = to_axes.transform((last + 0.09 * span, 0.0))
-    for line, height, label_height in zip(lines, heights, label_heights, strict=True):
-        look: dict[str, Any] = {"color": line.look[0], "transform": ax.transAxes}
+    for line, height, label_height in zip(
+        lines, heights, label_heights, strict=True
+    ):
+        look: dict[str, Any] = {
+            "color": line.look[0],
+            "transform": ax.transAxes,
+        }
         ax.plot([right, label_start], [height, label_height], lw=0.5, **look)
         look |= _SMALL_BOLD
-        ax.text(label_start, label_height, f" {line.label}", va="center", **look)
+        ax.text(
+            label_start, label_height, f" {line.label}", va="center", **look
+        )
 
 
 def _moved_apart(heights: Sequence[float]) -> list[float]:
@@ -322,14 +352,22 @@ def _draw_box(ax: Axes, place: float, summary: Summary, colour: str) -> None:
         patch_artist=True,
         whiskerprops=thin,
         capprops=thin,
-        boxprops={"facecolor": colour, "alpha": 0.3, "edgecolor": colour, "lw": 0.8},
+        boxprops={
+            "facecolor": colour,
+            "alpha": 0.3,
+            "edgecolor": colour,
+            "lw": 0.8,
+        },
         medianprops={"color": colour, "lw": 1.8},
         manage_ticks=False,
     )
 
 
 def draw_components(
-    title: str, note: str, components: Mapping[str, Mapping[str, Summary]], stem: Path
+    title: str,
+    note: str,
+    components: Mapping[str, Mapping[str, Summary]],
+    stem: Path,
 ) -> list[Path]:
     """Draw box plots of the components of the relative motions; return the paths of the files.
 
@@ -338,7 +376,9 @@ def draw_components(
     with page_style(**_STYLE):
         figure = _new_page(4.0, title, note)
         axes = figure.subplots(2, 3, sharey="row")
-        for ax, (name, summaries) in zip(axes.flat, components.items(), strict=True):
+        for ax, (name, summaries) in zip(
+            axes.flat, components.items(), strict=True
+        ):
             colours = []
             for place, (reference, summary) in enumerate(summaries.items()):
                 colour = REFERENCE_LOOKS[reference][0]
@@ -346,7 +386,9 @@ def draw_components(
                 colours.append(colour)
             ax.set_title(name)
             _coloured_ticks(ax, summaries, colours, fontweight="bold")
-        for row, unit, lowest in zip(axes, ("m", "deg"), (3e-4, 3e-2), strict=True):
+        for row, unit, lowest in zip(
+            axes, ("m", "deg"), (3e-4, 3e-2), strict=True
+        ):
             row[0].set_ylabel(unit)
             row[0].set_yscale("log")
             _write_plainly(row[0])

@@ -124,8 +124,12 @@ def _with_pressure_drift(
 
 
 # What a fault makes of measured positions (N, 3), at so many a second.
-_OF_POSITIONS: Mapping[str, Callable[[FloatArray, float, _Random], FloatArray]] = {
-    "1 Hz interpolated": lambda positions, hz, _: _interpolated(positions, round(hz)),
+_OF_POSITIONS: Mapping[
+    str, Callable[[FloatArray, float, _Random], FloatArray]
+] = {
+    "1 Hz interpolated": lambda positions, hz, _: _interpolated(
+        positions, round(hz)
+    ),
     "constant height": lambda positions, hz, _: positions * [1.0, 1.0, 0.0],
     "barometric height": _with_pressure_drift,
     "steps of 10 cm": lambda positions, hz, _: np.round(positions / 0.1) * 0.1,
@@ -142,7 +146,9 @@ def _beside(stream: Trajectory, translations: FloatArray) -> Trajectory:
 
 
 # Positions that were computed from the poses of the other sensor.
-_COPIES: Mapping[str, Callable[[Trajectory, FloatArray, _Random], Trajectory]] = {
+_COPIES: Mapping[
+    str, Callable[[Trajectory, FloatArray, _Random], Trajectory]
+] = {
     "copied": lambda parent, lever_arm, _: parent,
     "copied with noise": lambda parent, lever_arm, random: _beside(
         parent, 0.003 * random.standard_normal((len(parent), 3))
@@ -162,7 +168,8 @@ OF_POSITIONS = (*_OF_PATH, *_COPIES)
 def _interpolated(positions: FloatArray, stride: int) -> FloatArray:
     rows = np.arange(len(positions))
     columns = [
-        np.interp(rows, rows[::stride], column[::stride]) for column in positions.T
+        np.interp(rows, rows[::stride], column[::stride])
+        for column in positions.T
     ]
     return np.column_stack(columns)
 
@@ -179,7 +186,9 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
     """Poses of an odometry, and positions of an antenna with a fault of :data:`OF_POSITIONS`."""
     kind = PLATFORMS[platform]
     seeds = (seed, sorted(PLATFORMS).index(platform), 77)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
+        seeds
+    ).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
     parent = kind.measured(motion, odometry_rng)
@@ -191,7 +200,9 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
         return Recording(parent, child, lever_arm)
     fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
     Ts = motion.at(fine_s)
-    world = se3.rotation_exp(np.array([0.0, 0.0, mount_rng.uniform(-np.pi, np.pi)]))
+    world = se3.rotation_exp(
+        np.array([0.0, 0.0, mount_rng.uniform(-np.pi, np.pi)])
+    )
     path = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ world
     stride = round(_FINE_HZ / kind.positions_hz)
     taken = np.arange(stride // 4, len(fine_s), stride)
@@ -202,7 +213,9 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
     late_s = 0.15 if fault == "delayed 150 ms" else 0.0
     stamps = stamps_ns(fine_s[taken] + late_s)
     return Recording(
-        parent, Trajectory.from_positions(stamps, measured, "antenna", "map"), lever_arm
+        parent,
+        Trajectory.from_positions(stamps, measured, "antenna", "map"),
+        lever_arm,
     )
 
 
@@ -260,7 +273,9 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
     """Poses of an odometry, and rates of a gyroscope with a fault of :data:`OF_RATES`."""
     kind = PLATFORMS[platform]
     seeds = (seed, sorted(PLATFORMS).index(platform), 78)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
+        seeds
+    ).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     parent = kind.measured(motion, odometry_rng)
@@ -288,7 +303,9 @@ def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
     stamps_ns = parent.stamps_ns
     intervals_s = np.diff(stamps_ns) * 1e-9
     middles_ns = (stamps_ns[:-1] + stamps_ns[1:]) // 2
-    return Trajectory.from_rates(middles_ns, steps / intervals_s[:, None], "imu")
+    return Trajectory.from_rates(
+        middles_ns, steps / intervals_s[:, None], "imu"
+    )
 
 
 # Orientations of an attitude sensor: rate (Hz), white noise (rad), drift (rad per root s).
@@ -350,15 +367,21 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     """Poses of an odometry, and orientations with a fault of :data:`OF_ROTATIONS`."""
     kind = PLATFORMS[platform]
     seeds = (seed, sorted(PLATFORMS).index(platform), 79)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(seeds).spawn(4)
+    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
+        seeds
+    ).spawn(4)
     motion = kind.motion(motion_rng, kind.duration_s)
     mount = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     parent = kind.measured(motion, odometry_rng)
     if fault.startswith("copied"):
         turned = mount if fault == "copied, turned" else np.eye(3)
-        poses = parent.poses @ se3.from_rotation_translation(turned, np.zeros(3))
+        poses = parent.poses @ se3.from_rotation_translation(
+            turned, np.zeros(3)
+        )
         return Recording(
-            parent, Trajectory(parent.stamps_ns, poses, "ahrs", "", "rotations"), mount
+            parent,
+            Trajectory(parent.stamps_ns, poses, "ahrs", "", "rotations"),
+            mount,
         )
     fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
     own = motion.at(fine_s)[:, :3, :3] @ mount
@@ -375,7 +398,9 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
     if fault == "yaw only":
         walk[:2] = 0.0
         noise[:, :2] = 0.0
-    measured = se3.rotation_exp(walk * drift) @ measured @ se3.rotation_exp(noise)
+    measured = (
+        se3.rotation_exp(walk * drift) @ measured @ se3.rotation_exp(noise)
+    )
     if fault == "steps of 1 deg":
         vectors = Rotation.from_matrix(measured).as_euler("ZYX", degrees=True)
         measured = Rotation.from_euler(
@@ -484,7 +509,9 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
             options = options_of(kind, platform)
             for seed in seeds:
                 recording = make(platform, fault, seed)
-                result = hec.calibrate(recording.parent, recording.child, **options)
+                result = hec.calibrate(
+                    recording.parent, recording.child, **options
+                )
                 ratio = largest_ratio(kind, result, recording.truth)
                 tally.add(result, ratio, names)
         named = f"({tally.n_with_findings} findings)"
@@ -513,7 +540,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--seeds", type=int, default=2, help="recordings of a kind. Default: 2"
     )
-    parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
+    parser.add_argument(
+        "--first-seed", type=int, default=100, help="Default: 100"
+    )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

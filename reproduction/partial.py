@@ -107,7 +107,9 @@ def simulated_positions(
     poses = _odometry(machine.odometry, motion, times_s, step_s, odometry_rng)
 
     n_fixes = round((machine.duration_s - 1.0) * _FIXES_HZ)
-    fixes_s: FloatArray = (np.arange(n_fixes, dtype=np.float64) + 0.25) / _FIXES_HZ
+    fixes_s: FloatArray = (
+        np.arange(n_fixes, dtype=np.float64) + 0.25
+    ) / _FIXES_HZ
     Ts = motion.at(fixes_s)
     yaw = mount_rng.uniform(-np.pi, np.pi)
     world = se3.rotation_exp(np.array([0.0, 0.0, yaw]))
@@ -254,7 +256,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = study_parser("reproduction.partial", __doc__)
     parser.add_argument("what", choices=("rates", "positions"))
     parser.add_argument(
-        "--seeds", type=int, default=40, help="recordings of a kind. Default: 40"
+        "--seeds",
+        type=int,
+        default=40,
+        help="recordings of a kind. Default: 40",
     )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 

@@ -11,7 +11,9 @@ from reproduction.coverage import motions
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
 
-_WHEELS = SensorErrors(white=sigmas(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05))
+_WHEELS = SensorErrors(
+    white=sigmas(0.002, 0.02), walk_by_metre=sigmas(0.004, 0.05)
+)
 
 
 class Platform(NamedTuple):

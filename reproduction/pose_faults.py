@@ -24,7 +24,9 @@ from reproduction.platforms import PLATFORMS
 from reproduction.writing import counted, markdown_table, study_parser
 
 _CAMERA = SensorErrors(white=sigmas(0.001, 0.04), walk=sigmas(0.006, 0.05))
-_STEREO = SensorErrors(white=sigmas(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01))
+_STEREO = SensorErrors(
+    white=sigmas(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01)
+)
 
 # Odometry of the child of each platform, and its rate (Hz).
 _CHILDREN: Mapping[str, tuple[SensorErrors, float]] = {
@@ -48,7 +50,9 @@ _TARGETS = {
 
 # The assumed mount of a computed or fused stream is wrong by 8 cm and 3.5 deg.
 _WRONG_MOUNT = se3.exp(
-    np.array([0.05, -0.05, 0.04, *(np.radians(3.5) * np.array([0.6, -0.48, 0.64]))])
+    np.array(
+        [0.05, -0.05, 0.04, *(np.radians(3.5) * np.array([0.6, -0.48, 0.64]))]
+    )
 )
 
 # Standard deviations of the biases of an IMU: m/s^2 and rad/s.
@@ -86,7 +90,11 @@ def clean(platform: str, seed: int) -> Streams:
     margin_s = 0.3 + 0.37 / rate_hz
 
     def measured(
-        errors: SensorErrors, hz: float, mount: FloatArray, start_s: float, rng: _Random
+        errors: SensorErrors,
+        hz: float,
+        mount: FloatArray,
+        start_s: float,
+        rng: _Random,
     ) -> Trajectory:
         length_s = kind.duration_s - 1.0 - 2.0 * start_s
         n_poses = round(length_s * hz)
@@ -263,7 +271,9 @@ def largest_ratio(result: Calibration, truth: FloatArray) -> float:
     return fault_counts.largest_ratio(errors, result.sigmas)
 
 
-def rows(faults: Sequence[str], seeds: Sequence[int]) -> Iterator[dict[str, object]]:
+def rows(
+    faults: Sequence[str], seeds: Sequence[int]
+) -> Iterator[dict[str, object]]:
     """Rows of the table, one for each fault."""
     for fault in faults:
         names = FAULTS[fault].codes if fault in FAULTS else frozenset()
@@ -298,11 +308,15 @@ def run(arguments: argparse.Namespace) -> int:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
     parser = study_parser("reproduction.pose_faults", __doc__)
-    parser.add_argument("faults", nargs="*", help="rows of the table. Default: all")
+    parser.add_argument(
+        "faults", nargs="*", help="rows of the table. Default: all"
+    )
     parser.add_argument(
         "--seeds", type=int, default=1, help="recordings of a kind. Default: 1"
     )
-    parser.add_argument("--first-seed", type=int, default=100, help="Default: 100")
+    parser.add_argument(
+        "--first-seed", type=int, default=100, help="Default: 100"
+    )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

@@ -30,13 +30,16 @@ N_RUNS = 38
 # them.
 _LEVELS: dict[str, dict[str, float | None]] = {
     "noise": {
-        f"noise_{level:.6f}": level for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)
+        f"noise_{level:.6f}": level
+        for level in (0.0, 0.002, 0.004, 0.006, 0.008, 0.01)
     },
     "outliers": {
-        f"outliers_{level:.0f}": level for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
+        f"outliers_{level:.0f}": level
+        for level in (0.0, 2.0, 4.0, 6.0, 8.0, 10.0)
     },
     "drift": {
-        f"drift_{level:.6f}": level for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)
+        f"drift_{level:.6f}": level
+        for level in (0.0, 0.01, 0.02, 0.03, 0.04, 0.05)
     },
     "mixture": {".": None},
 }
@@ -48,7 +51,9 @@ _LEVEL_COLUMNS: dict[str, str | None] = {
 }
 SIMULATED = tuple(_LEVELS)
 KITTI = ("kitti_short", "kitti_long")
-LEVELS = {dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()}
+LEVELS = {
+    dataset: tuple(folders.values()) for dataset, folders in _LEVELS.items()
+}
 KEYFRAMES = "KeyFrameTrajectory_TUM_Format.txt"
 KITTI_DRIVES = ("2011_09_30_drive_0027", "2011_10_03_drive_0027")
 
@@ -138,7 +143,9 @@ def path_to(dataset: str, level: float | None) -> list[str]:
 # Name, parent, child, truth.
 Run = tuple[str, Trajectory, Trajectory, FloatArray]
 # By level (None without one), then by method and reference, in the order of the file.
-PublishedResults = dict[float | None, dict[tuple[str, str], list[PublishedResult]]]
+PublishedResults = dict[
+    float | None, dict[tuple[str, str], list[PublishedResult]]
+]
 
 
 def find_folder(folder: str | Path) -> str:
@@ -239,8 +246,12 @@ def load_simulated(
         results = _read_results(file, _LEVEL_COLUMNS[dataset])
         for level_folder, level in _LEVELS[dataset].items():
             if levels is None or level is None or level in levels:
-                runs = _read_runs(folder / "simulation_tests" / dataset / level_folder)
-                cases += _match_runs(dataset, level, runs, results.get(level, {}))
+                runs = _read_runs(
+                    folder / "simulation_tests" / dataset / level_folder
+                )
+                cases += _match_runs(
+                    dataset, level, runs, results.get(level, {})
+                )
     return cases
 
 
@@ -278,12 +289,15 @@ def _match_runs(
     for position, index in enumerate(order):
         run, parent, child, truth = runs[index]
         results_of_run = {key: rows[position] for key, rows in results.items()}
-        cases.append(Case(dataset, level, run, parent, child, truth, results_of_run))
+        cases.append(
+            Case(dataset, level, run, parent, child, truth, results_of_run)
+        )
     return cases
 
 
 def _order_of_runs(
-    runs: Sequence[Run], results: Mapping[tuple[str, str], Sequence[PublishedResult]]
+    runs: Sequence[Run],
+    results: Mapping[tuple[str, str], Sequence[PublishedResult]],
 ) -> list[int] | None:
     """Index of the run of each published row; None if runs and rows do not match."""
     if len(runs) != N_RUNS:
@@ -314,7 +328,9 @@ def _read_results(path: Path, level_column: str | None) -> PublishedResults:
             method = row["algorithm"].lower()
             reference = row["method"].replace("A1", "A")
             results_of_level = results.setdefault(level, {})
-            rows_of_method = results_of_level.setdefault((method, reference), [])
+            rows_of_method = results_of_level.setdefault(
+                (method, reference), []
+            )
             rows_of_method.append(_result(row))
     return results
 

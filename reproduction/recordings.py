@@ -80,7 +80,10 @@ class Truth:
         cls, T_parent_child: FloatArray, metres: object, degrees: object
     ) -> Truth:
         """Known to so many metres and degrees, one number or one per axis."""
-        parts = [np.full(3, 1.0) * metres, np.radians(np.full(3, 1.0) * degrees)]
+        parts = [
+            np.full(3, 1.0) * metres,
+            np.radians(np.full(3, 1.0) * degrees),
+        ]
         return cls(T_parent_child, np.concatenate(parts))
 
 
@@ -149,7 +152,9 @@ def _euroc(folder: Path) -> list[Rig]:
 
 
 SIMPLE_KITTI = _exact(
-    se3.from_quat_xyzw((0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723))
+    se3.from_quat_xyzw(
+        (0.8, -0.3, 0.5), (0.333307, -0.063488, 0.753055, 0.563723)
+    )
 )
 
 
@@ -232,7 +237,12 @@ def _zxl19(folder: Path) -> list[Rig]:
             truth=_ZXL19,
             is_cut=False,
         ),
-        Rig(name="zxl19_camera", recordings=cameras, options=camera, is_cut=False),
+        Rig(
+            name="zxl19_camera",
+            recordings=cameras,
+            options=camera,
+            is_cut=False,
+        ),
         _refused("zxl19_lidar without z", lidars, _FOUND),
         _refused("zxl19_camera without z", cameras, _SCALE_FOUND),
         _refused("zxl19_lidar_camera", recordings("LO", "VO"), _SCALE_FOUND),
@@ -296,26 +306,39 @@ def _robot_arm(folder: Path) -> list[Rig]:
 
 
 def _asl(folder: Path, *names: str) -> Recording:
-    return Recording(*(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names))
+    return Recording(
+        *(_read(folder / f"{name}.csv", _ASL_COLUMNS) for name in names)
+    )
 
 
 def _refused(
     name: str, recordings: Mapping[str, Recording], options: Mapping[str, Any]
 ) -> Rig:
     return Rig(
-        name=name, recordings=recordings, options=options, is_cut=False, is_refused=True
+        name=name,
+        recordings=recordings,
+        options=options,
+        is_cut=False,
+        is_refused=True,
     )
 
 
 def _single(
-    name: str, recording: Recording, truth: Truth | None, options: Mapping[str, Any]
+    name: str,
+    recording: Recording,
+    truth: Truth | None,
+    options: Mapping[str, Any],
 ) -> Rig:
-    return Rig(name=name, recordings={"whole": recording}, options=options, truth=truth)
+    return Rig(
+        name=name, recordings={"whole": recording}, options=options, truth=truth
+    )
 
 
 BOREAS = Truth.within(
     se3.from_rotation_translation(
-        Rotation.from_euler("xyz", [-180.0, 0.0, 46.67], degrees=True).as_matrix(),
+        Rotation.from_euler(
+            "xyz", [-180.0, 0.0, 46.67], degrees=True
+        ).as_matrix(),
         [0.0, 0.0, 0.21],
     ),
     0.0,

@@ -40,9 +40,15 @@ def mean_summary(values: ArrayLike) -> Summary:
     values = np.asarray(values)
     mean = values.mean()
     n = len(values)
-    half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
+    half = (
+        stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n)
+        if n > 1
+        else np.inf
+    )
     whiskers = float(values.min()), float(values.max())
-    return Summary(float(mean), float(mean - half), float(mean + half), whiskers, n)
+    return Summary(
+        float(mean), float(mean - half), float(mean + half), whiskers, n
+    )
 
 
 def quartile_summary(values: ArrayLike) -> Summary:
@@ -50,10 +56,13 @@ def quartile_summary(values: ArrayLike) -> Summary:
     values = np.sort(values)
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
     inside = values[
-        (values >= low - 1.5 * (high - low)) & (values <= high + 1.5 * (high - low))
+        (values >= low - 1.5 * (high - low))
+        & (values <= high + 1.5 * (high - low))
     ]
     whiskers = float(inside[0]), float(inside[-1])
-    return Summary(float(median), float(low), float(high), whiskers, len(values))
+    return Summary(
+        float(median), float(low), float(high), whiskers, len(values)
+    )
 
 
 class Table:
@@ -62,7 +71,12 @@ class Table:
     def __init__(self, rows: pd.DataFrame) -> None:
         keys = ["dataset", "level", "method", "reference"]
         self._errors = {
-            (dataset, None if np.isnan(level) else level, method, reference): errors
+            (
+                dataset,
+                None if np.isnan(level) else level,
+                method,
+                reference,
+            ): errors
             for (dataset, level, method, reference), group in rows.groupby(
                 keys, dropna=False
             )
@@ -78,12 +92,16 @@ class Table:
         metric: str,
     ) -> FloatArray:
         """(N,) errors of the runs."""
-        return self._errors[dataset, level, method, reference][:, METRICS.index(metric)]
+        return self._errors[dataset, level, method, reference][
+            :, METRICS.index(metric)
+        ]
 
     def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
         """Levels of a data set, ascending; (None,) for the mixture."""
         of_dataset = {
-            key[1] for key in self._errors if (key[0], key[2]) == (dataset, method)
+            key[1]
+            for key in self._errors
+            if (key[0], key[2]) == (dataset, method)
         }
         return tuple(sorted(of_dataset, key=lambda level: level or 0.0))
 
@@ -98,7 +116,9 @@ class Table:
         """As the paper does: the mixture by quartiles, the others by mean."""
         values = self.values(dataset, level, method, reference, metric)
         return (
-            quartile_summary(values) if dataset == "mixture" else mean_summary(values)
+            quartile_summary(values)
+            if dataset == "mixture"
+            else mean_summary(values)
         )
 
     def score(
@@ -109,17 +129,23 @@ class Table:
         """
         levels = self.levels(dataset, method)
         summaries = [
-            self.summary(dataset, level, method, reference, metric) for level in levels
+            self.summary(dataset, level, method, reference, metric)
+            for level in levels
         ]
         return float(np.mean([summary.centre for summary in summaries]))
 
-    def ranking(self, dataset: str, method: str, metric: str = "e_at") -> list[str]:
+    def ranking(
+        self, dataset: str, method: str, metric: str = "e_at"
+    ) -> list[str]:
         """References from the smallest score to the largest."""
         return sorted(
-            REFERENCES, key=lambda name: self.score(dataset, method, name, metric)
+            REFERENCES,
+            key=lambda name: self.score(dataset, method, name, metric),
         )
 
-    def best_reference(self, dataset: str, method: str, metric: str = "e_at") -> str:
+    def best_reference(
+        self, dataset: str, method: str, metric: str = "e_at"
+    ) -> str:
         """The reference with the smallest score."""
         return self.ranking(dataset, method, metric)[0]
 
@@ -143,7 +169,9 @@ class Results:
     def theirs(self) -> Table:
         """The published errors of the same trajectories."""
         named = dict(zip(PUBLISHED, METRICS, strict=True))
-        return Table(self.rows.drop(columns=list(METRICS)).rename(columns=named))
+        return Table(
+            self.rows.drop(columns=list(METRICS)).rename(columns=named)
+        )
 
     def of(self, dataset: str, method: str) -> pd.DataFrame:
         """Rows of a method on a data set."""

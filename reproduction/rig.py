@@ -48,7 +48,9 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
     for sensor, (white_m, white_rad, walk_m, walk_rad) in enumerate(errors):
         if sensor > 0:
             Xs.append(
-                se3.exp(np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)])
+                se3.exp(
+                    np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)]
+                )
             )
         true = parent.poses @ Xs[sensor]
         steps = (
@@ -59,7 +61,9 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
         driven = [true[0]]
         for step in steps:
             driven.append(driven[-1] @ step)
-        poses.append(np.array(driven) @ _errors(random, n_poses, white_m, white_rad))
+        poses.append(
+            np.array(driven) @ _errors(random, n_poses, white_m, white_rad)
+        )
     return Rig(parent.stamps_ns, np.array(poses), np.array(Xs), errors)
 
 
@@ -109,10 +113,14 @@ def outcome(rig: Rig) -> Outcome:
             back @ calibration.T(names[first], names[second])
         )
         own.append(
-            np.diag(calibration.covariance_measured(names[first], names[second]))
+            np.diag(
+                calibration.covariance_measured(names[first], names[second])
+            )
         )
     pairwise = [
-        se3.log(se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ neighbour.T_parent_child)
+        se3.log(
+            se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ neighbour.T_parent_child
+        )
         for at, neighbour in enumerate(calibration.neighbours, start=1)
     ]
     return Outcome(
@@ -138,7 +146,8 @@ def simulated_table(repeats: int, n_poses: int) -> str:
         for n_sensors in (3, 5):
             errors = errors_of(n_sensors)
             outcomes = [
-                outcome(simulated(seed, n_poses, errors)) for seed in range(repeats)
+                outcome(simulated(seed, n_poses, errors))
+                for seed in range(repeats)
             ]
             rows.append({"Sensors": name, "S": n_sensors, **_row(outcomes)})
     return markdown_table(rows)
@@ -150,7 +159,9 @@ def _row(outcomes: Sequence[Outcome]) -> dict[str, str]:
         for name in ("squares", "pairwise_squares")
     )
     misclosures_m = [draw.closes_m for draw in outcomes]
-    inside = np.mean([np.abs(draw.in_sigmas) < QUANTILE_90 for draw in outcomes])
+    inside = np.mean(
+        [np.abs(draw.in_sigmas) < QUANTILE_90 for draw in outcomes]
+    )
     return {
         "Neighbours: error / own answer": f"{np.sqrt(np.mean(squares / pairwise)):.2f}",
         "Within 90 % interval": f"{100 * inside:.0f} %",

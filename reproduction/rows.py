@@ -37,7 +37,15 @@ TITLES = {
     "zhuang": "Zhuang",
 }
 _COLUMNS = (
-    *("dataset", "level", "run", "method", "reference", "converged", "T_parent_child"),
+    *(
+        "dataset",
+        "level",
+        "run",
+        "method",
+        "reference",
+        "converged",
+        "T_parent_child",
+    ),
     *(*METRICS, "objective", *PUBLISHED, "published_objective"),
 )
 
@@ -88,10 +96,14 @@ def _cases(source: Source, dataset: str, level: float | None) -> list[Case]:
 def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
     pairs = case.pairs(reference)
     solve = (
-        ali_as_published.solve if method == ALI_AS_PUBLISHED else Method(method).solve
+        ali_as_published.solve
+        if method == ALI_AS_PUBLISHED
+        else Method(method).solve
     )
     solution = solve(pairs)
-    errors_of_solution = errors(pairs, solution.T_parent_child, case.T_parent_child)
+    errors_of_solution = errors(
+        pairs, solution.T_parent_child, case.T_parent_child
+    )
     row = {
         "dataset": case.dataset,
         "level": case.level,
@@ -106,7 +118,9 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
     result = case.results.get((published_name(method), reference))
     if result:
         row |= dict(zip(PUBLISHED, in_m_and_deg(result.errors), strict=True))
-        row["published_objective"] = _objective(method, pairs, result.T_parent_child)
+        row["published_objective"] = _objective(
+            method, pairs, result.T_parent_child
+        )
     return row
 
 
@@ -144,15 +158,28 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     higher than at the published answer. ``why``: why a row does not agree.
     """
     table = pd.DataFrame(rows, columns=list(_COLUMNS))
-    numbers = ["level", *METRICS, "objective", *PUBLISHED, "published_objective"]
+    numbers = [
+        "level",
+        *METRICS,
+        "objective",
+        *PUBLISHED,
+        "published_objective",
+    ]
     table[numbers] = table[numbers].astype(float)
     table["case"] = [
         "/".join(
-            [*path_to(row.dataset, None if np.isnan(row.level) else row.level), row.run]
+            [
+                *path_to(
+                    row.dataset, None if np.isnan(row.level) else row.level
+                ),
+                row.run,
+            ]
         )
         for row in table.itertuples()
     ]
-    same = agree(table[list(METRICS)].to_numpy(), table[list(PUBLISHED)].to_numpy())
+    same = agree(
+        table[list(METRICS)].to_numpy(), table[list(PUBLISHED)].to_numpy()
+    )
     table["agrees"] = same.all(axis=1)
     table["same_e_at"] = same[:, 2]
     ours = table["objective"].to_numpy()
@@ -162,7 +189,9 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
         ["", "higher", "lower"],
         "equal",
     )
-    unsettled = "the iteration does not settle: its last step depends on rounding"
+    unsettled = (
+        "the iteration does not settle: its last step depends on rounding"
+    )
     reasons = {
         "": table["published_e_at"].isna() | table["agrees"],
         "published answer is not the minimum: ours has the lower objective": table[
@@ -176,7 +205,9 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
         & ~table["dataset"].isin(KITTI),
         unsettled: ~table["converged"].astype(bool),
     }
-    table["why"] = np.select(list(reasons.values()), list(reasons), "unexplained")
+    table["why"] = np.select(
+        list(reasons.values()), list(reasons), "unexplained"
+    )
     return table
 
 

@@ -43,7 +43,9 @@ def kept(
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     outcomes: dict[str, Any] = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+    for line in (
+        path.read_text(encoding="utf-8").splitlines() if path.exists() else ()
+    ):
         with contextlib.suppress(ValueError):  # a line that was cut off
             outcomes |= json.loads(line)
     missing = [name for name in tasks if name not in outcomes]
@@ -52,6 +54,11 @@ def kept(
         for name, result in zip(missing, results, strict=True):
             outcomes[name] = result
             print(
-                "", json.dumps({name: result}), sep="\n", end="", file=file, flush=True
+                "",
+                json.dumps({name: result}),
+                sep="\n",
+                end="",
+                file=file,
+                flush=True,
             )
     return outcomes

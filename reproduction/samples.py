@@ -15,7 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer,
+)
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
@@ -49,7 +54,9 @@ def write_sample_bag(path: Path) -> None:
     streams = {}
     for name in ("lidar", "camera"):
         trajectory = read_trajectory(f"sample:{name}.tum")
-        named = replace(trajectory, world_frame=f"{name}_odom", sensor_frame=name)
+        named = replace(
+            trajectory, world_frame=f"{name}_odom", sensor_frame=name
+        )
         streams[f"/{name}/odometry"] = (named, "nav_msgs/msg/Odometry")
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "drive"

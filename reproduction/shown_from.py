@@ -117,7 +117,13 @@ def outcome(
     rules = {reason.rule for reason in result.reasons}
     is_undetectable = "undetectable" in rules
     return Outcome(
-        platform, exceeds, found[is_stated], of_streams, shift, cost, is_undetectable
+        platform,
+        exceeds,
+        found[is_stated],
+        of_streams,
+        shift,
+        cost,
+        is_undetectable,
     )
 
 
@@ -143,7 +149,9 @@ def _errors_found(
     scatter, differences = injection.trials(blocks, columns, R, sigmas)
     trial = rng.integers(len(differences))
     signs = rng.choice([-1.0, 1.0], 8)
-    wrong = differences[trial, :6] + signs[:6] * np.array([*sizes.errors.values()])
+    wrong = differences[trial, :6] + signs[:6] * np.array(
+        [*sizes.errors.values()]
+    )
     found = np.abs(wrong) > injection.thresholds_of(scatter[:6], allowance[:6])
     columns = [*range(8)]
     scatter, differences = injection.trials(blocks, columns, R, sigmas)
@@ -197,29 +205,42 @@ def _shift_found(
 def of_recordings(folder: Path) -> Iterator[Outcome]:
     """Yield the outcome of each real recording."""
     for number, rig in enumerate(real_rigs(folder)[0]):
-        truth = (rig.truth.T_parent_child, rig.truth.sigmas) if rig.truth else None
+        truth = (
+            (rig.truth.T_parent_child, rig.truth.sigmas) if rig.truth else None
+        )
         for recording in rig.recordings.values():
             streams = (recording.parent, recording.child)
-            yield outcome("real", streams, streams, truth, dict(rig.options), number)
+            yield outcome(
+                "real", streams, streams, truth, dict(rig.options), number
+            )
 
 
 def table(outcomes: list[Outcome]) -> str:
     """Return the table of all platforms."""
     rows = []
     for platform in [*sorted({item.platform for item in outcomes}), "all"]:
-        chosen = [item for item in outcomes if platform in (item.platform, "all")]
+        chosen = [
+            item for item in outcomes if platform in (item.platform, "all")
+        ]
         columns = {
             "true error exceeds": [item.exceeds for item in chosen],
             "error found": [item.errors for item in chosen],
             "clock, lengths found": [item.streams for item in chosen],
             "shift reported": [item.shift for item in chosen],
-            "`undetectable`": [np.array([item.is_undetectable]) for item in chosen],
+            "`undetectable`": [
+                np.array([item.is_undetectable]) for item in chosen
+            ],
         }
-        row: dict[str, object] = {"platform": platform, "recordings": len(chosen)}
+        row: dict[str, object] = {
+            "platform": platform,
+            "recordings": len(chosen),
+        }
         for title, parts in columns.items():
             values = np.concatenate(parts)
             row[title] = (
-                f"{np.mean(values):.1%} of {len(values)}" if len(values) else "-"
+                f"{np.mean(values):.1%} of {len(values)}"
+                if len(values)
+                else "-"
             )
         row["cost, solves"] = f"{np.mean([item.cost for item in chosen]):.2f}"
         rows.append(row)
@@ -231,8 +252,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m reproduction.shown_from", description=__doc__
     )
-    parser.add_argument("--drives", type=int, default=200, help="simulated drives")
-    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    parser.add_argument(
+        "--drives", type=int, default=200, help="simulated drives"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="default: another one at every run"
+    )
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument(
         "--data-folder", type=Path, help="folder of the real recordings"

@@ -62,7 +62,9 @@ class SimulatedSource:
         for number in range(self.runs):
             drive = simulate_drive((self.seed, number), PUBLISHED_DRIVE, noise)
             streams = drive.parent, drive.child, drive.T_parent_child
-            cases.append(Case(dataset, level, f"run_{number + 1:02}", *streams, {}))
+            cases.append(
+                Case(dataset, level, f"run_{number + 1:02}", *streams, {})
+            )
         return cases
 
 

@@ -23,7 +23,8 @@ _DRIVES = {
 VARIANT_TABLES = {
     f"tableS{number}": (dataset, method)
     for number, (dataset, method) in enumerate(
-        ((dataset, method) for dataset in _DRIVES for method in METHODS), start=1
+        ((dataset, method) for dataset in _DRIVES for method in METHODS),
+        start=1,
     )
 }
 
@@ -70,7 +71,8 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
     truth = RECTIFIED[rows["dataset"].iloc[0]]
     indexed = rows.set_index(["method", "reference"])
     errors = [
-        absolute_errors(np.reshape(T, (4, 4)), truth) for T in indexed["T_parent_child"]
+        absolute_errors(np.reshape(T, (4, 4)), truth)
+        for T in indexed["T_parent_child"]
     ]
     indexed[list(_RECTIFIED)] = np.array(errors) * [1.0, 180.0 / np.pi]
     indexed = indexed.rename(columns=dict(zip(METRICS, _ERRORS, strict=True)))
@@ -101,7 +103,10 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
     smallest = best[[*_ERRORS, *_RECTIFIED]].min()
     printed = (
         {"method": f"{TITLES[method]} {reference}"}
-        | {column: _print(row[column], smallest.get(column)) for column in _COLUMNS}
+        | {
+            column: _print(row[column], smallest.get(column))
+            for column in _COLUMNS
+        }
         for (method, reference), row in best.iterrows()
     )
     table = best[list(_COLUMNS)].reset_index(names=["method", "variant"])
@@ -144,7 +149,9 @@ def _compare_with_print(
         for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
             ours = float(best.loc[(method, reference), column])
             agrees = (
-                np.isnan(ours) if number is None else abs(ours - number) <= _SAME_PRINT
+                np.isnan(ours)
+                if number is None
+                else abs(ours - number) <= _SAME_PRINT
             )
             cells.append(
                 {
@@ -167,7 +174,9 @@ def _compare_with_print(
             f"# {name}: comparison with the paper",
             "Cells that agree with the printed table to its three decimals: "
             f"{percent(compared['agrees'].sum(), len(compared))}.",
-            markdown_table(compared[~compared["agrees"]].round(4).to_dict("records")),
+            markdown_table(
+                compared[~compared["agrees"]].round(4).to_dict("records")
+            ),
             "## Every variant, against the published results in full precision",
             comparison.describe_rows(solved),
             comparison.describe_dnlo(solved),

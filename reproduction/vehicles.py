@@ -57,7 +57,9 @@ class Drive(NamedTuple):
 
 def drive(seed: int, model: str, course: str = "eights") -> Drive:
     """Simulate a machine and calibrate its sensor."""
-    machine = simulate_machine(seed, "wheels" if model == "driving" else model, course)
+    machine = simulate_machine(
+        seed, "wheels" if model == "driving" else model, course
+    )
     wheels = None if model == "driving" else machine.wheels
     result = calibrate_vehicle(machine.sensor, wheels, child_kind="exact")
     errors, sigmas = _errors_of(result, machine)
@@ -74,7 +76,11 @@ def _errors_of(
         x=float(T[0, 3] - machine.T_base_sensor[0, 3]),
         y=float(T[1, 3] - machine.T_base_sensor[1, 3]),
         **dict(
-            zip(("roll", "pitch", "yaw"), se3.rotation_log(turn).tolist(), strict=True)
+            zip(
+                ("roll", "pitch", "yaw"),
+                se3.rotation_log(turn).tolist(),
+                strict=True,
+            )
         ),
     )
     rows = {"x": 0, "y": 1, "roll": 3, "pitch": 4, "yaw": 5}
@@ -83,7 +89,9 @@ def _errors_of(
     if wheels is not None:
         errors["clock"] = result.time_offset_s - machine.clock_s
         sigmas["clock"] = result.time_offset_sigma_s
-        for item, truth in zip(wheels.parameters, machine.parameters, strict=True):
+        for item, truth in zip(
+            wheels.parameters, machine.parameters, strict=True
+        ):
             unit = 1.0 if item.name.endswith("offset") else truth
             errors[item.name] = (item.value - truth) / unit
             sigmas[item.name] = item.sigma / unit
@@ -97,15 +105,23 @@ def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
         results = []
         for row in range(n_drives):
             machine = simulate_machine(
-                seed + row, model, course, slip=slip, ramp_rad=np.radians(ramp_deg)
+                seed + row,
+                model,
+                course,
+                slip=slip,
+                ramp_rad=np.radians(ramp_deg),
             )
             result = calibrate_vehicle(
                 machine.sensor, machine.wheels, child_kind="exact"
             )
             errors, sigmas = _errors_of(result, machine)
-            results.append(Drive(errors, sigmas, result.verdict.value, result.headline))
+            results.append(
+                Drive(errors, sigmas, result.verdict.value, result.headline)
+            )
         largest = {
-            axis: _with_unit(axis, max(abs(item.errors[axis]) for item in results))
+            axis: _with_unit(
+                axis, max(abs(item.errors[axis]) for item in results)
+            )
             for axis in ("x", "y", "yaw")
         }
         ratios = [
@@ -130,7 +146,9 @@ def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     drives = list(drives)
     for name in drives[0].errors:
-        ratios = np.array([item.ratios[name] for item in drives if name in item.ratios])
+        ratios = np.array(
+            [item.ratios[name] for item in drives if name in item.ratios]
+        )
         errors = np.array(
             [abs(item.errors[name]) for item in drives if name in item.ratios]
         )
@@ -178,8 +196,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m reproduction.vehicles", description=__doc__
     )
-    parser.add_argument("--drives", type=int, default=30, help="drives of each machine")
-    parser.add_argument("--seed", type=int, help="default: another one at every run")
+    parser.add_argument(
+        "--drives", type=int, default=30, help="drives of each machine"
+    )
+    parser.add_argument(
+        "--seed", type=int, help="default: another one at every run"
+    )
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
     print(f"seeds from {seed}\n")
@@ -195,10 +217,12 @@ def main() -> int:
     for course in _DEGENERATE:
         for model in _MODELS:
             refused = [
-                drive(seed + row, model, course) for row in range(arguments.drives // 3)
+                drive(seed + row, model, course)
+                for row in range(arguments.drives // 3)
             ]
             beyond = [
-                max(item.ratios.values(), default=0.0) > _BEYOND for item in refused
+                max(item.ratios.values(), default=0.0) > _BEYOND
+                for item in refused
             ]
             used = [item.verdict == "USE" for item in refused]
             rows.append(
@@ -207,9 +231,9 @@ def main() -> int:
                     "Machine": model,
                     "Verdicts": counted(item.verdict for item in refused),
                     "USE beyond 3.3": int(np.sum(np.logical_and(beyond, used))),
-                    "Such as": Counter(item.headline for item in refused).most_common(
-                        1
-                    )[0][0],
+                    "Such as": Counter(
+                        item.headline for item in refused
+                    ).most_common(1)[0][0],
                 }
             )
     show(None, {"degenerate": markdown_table(rows)})

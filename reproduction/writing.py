@@ -60,7 +60,9 @@ def put_into_page(page: Path, name: str, text: str) -> None:
             f"{page} has no lines {begin.strip()} and {end} to put the tables into"
         )
     body = re.sub(r"\A# .*\n+", "", text).strip()
-    page.write_text(f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8")
+    page.write_text(
+        f"{before}{begin}\n{body}\n\n{end}{after}", encoding="utf-8"
+    )
 
 
 def study_parser(
@@ -117,7 +119,9 @@ def counted(words: Iterable[str], most: int | None = None) -> str:
     )
 
 
-def triple(values: Iterable[float], factor: float = 1.0, form: str = ".1f") -> str:
+def triple(
+    values: Iterable[float], factor: float = 1.0, form: str = ".1f"
+) -> str:
     """Numbers times a factor, a comma between them."""
     words = [f"{factor * value:{form}}" for value in values]
     return ", ".join(words)

@@ -96,7 +96,9 @@ def pose(typestore, matrix, kind="Pose"):
     translation = matrix[:3, 3].tolist()
     quat_xyzw = se3.to_quat_xyzw(matrix).tolist()
     vector = types[
-        "geometry_msgs/msg/Point" if kind == "Pose" else "geometry_msgs/msg/Vector3"
+        "geometry_msgs/msg/Point"
+        if kind == "Pose"
+        else "geometry_msgs/msg/Vector3"
     ](*translation)
     return types[f"geometry_msgs/msg/{kind}"](
         vector, types["geometry_msgs/msg/Quaternion"](*quat_xyzw)
@@ -156,7 +158,8 @@ def path_message(stamps_ns, poses, frame="map"):
             for stamp_ns, matrix in zip(stamps_ns, poses, strict=True)
         ]
         return typestore.types[PATH](
-            header(typestore, stamps_ns[-1] if len(stamps_ns) else 0, frame), steps
+            header(typestore, stamps_ns[-1] if len(stamps_ns) else 0, frame),
+            steps,
         )
 
     return make
@@ -171,7 +174,9 @@ def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
     vector = types["geometry_msgs/msg/Vector3"]
     message = types["sensor_msgs/msg/Imu"](
         header=header(JAZZY, stamp_ns, "imu_link"),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8),
+        orientation=types["geometry_msgs/msg/Quaternion"](
+            x=0.0, y=0.0, z=0.6, w=0.8
+        ),
         orientation_covariance=covariance,
         angular_velocity=vector(*rates),
         angular_velocity_covariance=of_rates,
@@ -181,7 +186,13 @@ def imu(rates, first_covariance=0.0, stamp_ns=12_000_000_005):
     return bytes(JAZZY.serialize_cdr(message, message.__msgtype__))
 
 
-def fix(status, latitude=60.0, longitude=25.0, altitude=30.0, stamp_ns=12_000_000_005):
+def fix(
+    status,
+    latitude=60.0,
+    longitude=25.0,
+    altitude=30.0,
+    stamp_ns=12_000_000_005,
+):
     """A serialised NavSatFix (deg, deg, m)."""
     types = JAZZY.types
     message = types["sensor_msgs/msg/NavSatFix"](

@@ -113,9 +113,9 @@ class Browser:
         self.session = None
         self._waiting.clear()
         tab = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self.session = self.call("Target.attachToTarget", targetId=tab, flatten=True)[
-            "sessionId"
-        ]
+        self.session = self.call(
+            "Target.attachToTarget", targetId=tab, flatten=True
+        )["sessionId"]
         self.call("Page.enable")
         self.call("Page.addScriptToEvaluateOnNewDocument", source=script)
         self.call("Page.navigate", url=address)
@@ -214,5 +214,7 @@ def printed_pages(page, folder):
         f"--print-to-pdf={pdf}",
         page.as_uri(),
     ]
-    subprocess.run(arguments, check=True, capture_output=True, timeout=PATIENCE_S)
+    subprocess.run(
+        arguments, check=True, capture_output=True, timeout=PATIENCE_S
+    )
     return len(re.findall(rb"/Type /Page\b", pdf.read_bytes()))

@@ -18,7 +18,8 @@ from reproduction.machines import simulate_machine
 
 # Lidar to camera on the pages: x 0.4 m, z 1.85 m, yaw -90 deg.
 T_LIDAR_CAMERA = se3.from_quat_xyzw(
-    np.array([0.4, 0.0, 1.85]), Rotation.from_euler("z", -90, degrees=True).as_quat()
+    np.array([0.4, 0.0, 1.85]),
+    Rotation.from_euler("z", -90, degrees=True).as_quat(),
 )
 _POSES = 250
 _ODOMETRY = "nav_msgs/msg/Odometry"
@@ -36,8 +37,8 @@ _ROBOT = """\
 
 
 def make(folder: Path) -> None:
-    """Fill a folder: ``my_drive/``, ``my_yard/``, ``lidar.tum``, ``camera.tum``, ``camera.csv``, ``ins.csv``,
-    ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``,
+    """Fill a folder: ``my_drive/``, ``my_yard/``, ``lidar.tum``, ``camera.tum``,
+    ``camera.csv``, ``ins.csv``, ``gnss.csv``, ``imu.csv``, ``flange.tum``, ``camera_on_arm.tum``,
     ``samples.yaml``, ``robot.urdf``, ``robot_lidar.tum``, ``wheels.csv``, and results.
 
     INS, antenna and IMU are where the camera is.
@@ -56,7 +57,9 @@ def _write_drive(folder):
     """Write the streams of a vehicle; return those of lidar and camera."""
     drive = simulate_drive(7, HILLY_DRIVE).parent[:_POSES]
     lidar = _noisy(drive.stamps_ns, drive.poses, 1, "lidar", "odom")
-    camera = _noisy(drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo")
+    camera = _noisy(
+        drive.stamps_ns, drive.poses @ T_LIDAR_CAMERA, 2, "camera", "vo"
+    )
     hec.write_trajectory(folder / "lidar.tum", lidar)
     hec.write_trajectory(folder / "camera.tum", camera)
     rows = _rows(camera, scalar_first=True)
@@ -87,7 +90,9 @@ def _write_arm(folder, stamps_ns):
     flange = wandering_poses(_POSES, seed=3)
     camera = flange @ T_LIDAR_CAMERA
     hec.write_trajectory(folder / "flange.tum", _noisy(stamps_ns, flange, 3))
-    hec.write_trajectory(folder / "camera_on_arm.tum", _noisy(stamps_ns, camera, 4))
+    hec.write_trajectory(
+        folder / "camera_on_arm.tum", _noisy(stamps_ns, camera, 4)
+    )
 
     noisy_camera = disturbed(camera, 5, 1e-3, 5e-4)
     flange_stops = flange[::10].tolist()
@@ -144,7 +149,9 @@ def _write_bag(path, lidar, camera, places, rates):
         }
         write_streams(writer, streams, "mcap")
         connection = writer.add_connection("/tf", TF, typestore=JAZZY)
-        for stamp_ns, pose in zip(lidar.stamps_ns.tolist(), lidar.poses, strict=True):
+        for stamp_ns, pose in zip(
+            lidar.stamps_ns.tolist(), lidar.poses, strict=True
+        ):
             message = tf_message([(stamp_ns, "odom", "lidar", pose)])(JAZZY)
             writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, TF))
         connection = writer.add_connection(
@@ -153,11 +160,15 @@ def _write_bag(path, lidar, camera, places, rates):
         for stamp_ns, place in zip(
             camera.stamps_ns.tolist(), places.tolist(), strict=True
         ):
-            writer.write(connection, stamp_ns, fix(2, *place, stamp_ns=stamp_ns))
+            writer.write(
+                connection, stamp_ns, fix(2, *place, stamp_ns=stamp_ns)
+            )
         connection = writer.add_connection(
             "/imu", "sensor_msgs/msg/Imu", typestore=JAZZY
         )
-        for stamp_ns, rate in zip(rates[0].tolist(), rates[1].tolist(), strict=True):
+        for stamp_ns, rate in zip(
+            rates[0].tolist(), rates[1].tolist(), strict=True
+        ):
             writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
 
 
@@ -179,7 +190,13 @@ def _write_ins(path, trajectory, places):
         .as_euler("ZYX", degrees=True)
         .T
     )
-    columns = [trajectory.stamps_ns * 1e-9, places, roll, -pitch, (90 - yaw) % 360]
+    columns = [
+        trajectory.stamps_ns * 1e-9,
+        places,
+        roll,
+        -pitch,
+        (90 - yaw) % 360,
+    ]
     names = "time,latitude,longitude,height,roll_deg,pitch_deg,heading_deg"
     _write_csv(path, names, np.column_stack(columns))
 

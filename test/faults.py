@@ -76,8 +76,14 @@ FAULTS = {
         lambda parent, child, other: (parent, child.scaled(1000.0)),
         "units",
     ),
-    "scale 1.05": (lambda parent, child, other: (parent, child.scaled(1.05)), "scale"),
-    "frozen child": (lambda parent, child, other: (parent, frozen(child)), "frozen"),
+    "scale 1.05": (
+        lambda parent, child, other: (parent, child.scaled(1.05)),
+        "scale",
+    ),
+    "frozen child": (
+        lambda parent, child, other: (parent, frozen(child)),
+        "frozen",
+    ),
     "swapped axes": (
         lambda parent, child, other: (parent, with_swapped_axes(child)),
         "axes",

@@ -91,7 +91,9 @@ class Machine:
         self.times_s = np.arange(0.0, duration_s, STEP_S)
         self.T_base_parent = self._mount([0.8, 0.0, 1.4], 8.0)
         self.T_base_child = self._mount([-0.8, 0.4, 1.1], 8.0)
-        self.T_parent_child = se3.inverse(self.T_base_parent) @ self.T_base_child
+        self.T_parent_child = (
+            se3.inverse(self.T_base_parent) @ self.T_base_child
+        )
         self.Ts_world_base = self._drive()
 
     def _mount(self, position: list[float], tilt_deg: float) -> FloatArray:
@@ -110,7 +112,9 @@ class Machine:
         on_ramp_m = np.clip(x - 2.0, 0.0, 8.0)
         z = z + place.ramp * on_ramp_m
         amplitude_m = place.bump_m / 2
-        for (along_x, along_y), phase in zip(self.waves, self.phases, strict=True):
+        for (along_x, along_y), phase in zip(
+            self.waves, self.phases, strict=True
+        ):
             angle = along_x * x + along_y * y + phase
             z = z + amplitude_m * np.sin(angle)
         return z
@@ -153,9 +157,9 @@ class Machine:
         return drifting @ se3.exp(white)
 
     def _trajectory(self, T_base_sensor: FloatArray, frame: str) -> Trajectory:
-        stamps_ns = START_NS + np.round(self.times_s[::POSE_STEPS] * 1e9).astype(
-            np.int64
-        )
+        stamps_ns = START_NS + np.round(
+            self.times_s[::POSE_STEPS] * 1e9
+        ).astype(np.int64)
         return hec.Trajectory(
             stamps_ns, self._poses(T_base_sensor), frame, f"{frame}_odom"
         )
@@ -195,7 +199,9 @@ class Machine:
         elevation_errors_deg = self.noise * (ring_errors_deg + common_error_deg)
         bias_m = self.noise * rng.normal(0, 0.01)
         stated_rays = _rays(elevations, n_columns)
-        true_rays = _rays(elevations + np.radians(elevation_errors_deg), n_columns)
+        true_rays = _rays(
+            elevations + np.radians(elevation_errors_deg), n_columns
+        )
 
         for row in range(0, len(self.times_s), POSE_STEPS * stride):
             T = self.Ts_world_base[row] @ T_base_sensor
@@ -214,14 +220,19 @@ class Machine:
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = 1.0 / directions
         for lower, upper in self.place.boxes:
-            first, second = (lower - origin) * inverse, (upper - origin) * inverse
+            first, second = (
+                (lower - origin) * inverse,
+                (upper - origin) * inverse,
+            )
             near = np.minimum(first, second).max(axis=1)
             far = np.maximum(first, second).min(axis=1)
             is_hit = (near < far) & (near > 0.0) & (near < distances)
             distances = np.where(is_hit, near, distances)
         return distances
 
-    def _ground_ranges(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+    def _ground_ranges(
+        self, origin: FloatArray, directions: FloatArray
+    ) -> FloatArray:
         """Ranges of the ground along rays, by fixed-point iteration on its height."""
         down = directions[:, 2]
         is_falling = down < -0.01
@@ -240,7 +251,9 @@ class Machine:
             distances = np.where(is_falling, distances, REACH_M)
         return distances
 
-    def accelerations(self, T_base_sensor: FloatArray) -> tuple[IntArray, FloatArray]:
+    def accelerations(
+        self, T_base_sensor: FloatArray
+    ) -> tuple[IntArray, FloatArray]:
         """Stamps (ns) and specific forces (N, 3), m/s^2, of an accelerometer at 100 Hz."""
         rng = self.rng
         Ts = self.Ts_world_base @ T_base_sensor
@@ -300,13 +313,17 @@ def _rays(elevations: FloatArray, n_columns: int) -> FloatArray:
     return directions.reshape(-1, 3)
 
 
-def _smooth_noise(rng: np.random.Generator, count: int, steps: int) -> FloatArray:
+def _smooth_noise(
+    rng: np.random.Generator, count: int, steps: int
+) -> FloatArray:
     """Noise of unit variance that is smooth over a number of steps."""
     noise = gaussian_filter1d(rng.standard_normal(count), steps)
     return noise / noise.std()
 
 
-def calibrated_machine(machine: Machine, sensors: str = "lidars") -> Calibration:
+def calibrated_machine(
+    machine: Machine, sensors: str = "lidars"
+) -> Calibration:
     """Calibrate both lidars of a machine, or its lidar and its IMU, with the ground."""
     every = 10 if machine.rings == 16 else 20
     clouds = machine.clouds(machine.T_base_parent, every)
@@ -329,7 +346,9 @@ def calibrated_machine(machine: Machine, sensors: str = "lidars") -> Calibration
     )
 
 
-def score_of(place: str, sensors: str, rings: int, seeds: Sequence[int]) -> TableRow:
+def score_of(
+    place: str, sensors: str, rings: int, seeds: Sequence[int]
+) -> TableRow:
     """Return a row of the table: root mean square errors, and the share of covered errors."""
     all_errors = []
     all_sigmas = []
@@ -367,9 +386,13 @@ def main() -> None:
     """Print a table of errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--places", nargs="+", default=["yard"], choices=PLACES)
-    parser.add_argument("--sensors", default="lidars", choices=("lidars", "imu"))
+    parser.add_argument(
+        "--sensors", default="lidars", choices=("lidars", "imu")
+    )
     parser.add_argument("--rings", type=int, default=16, choices=ELEVATIONS)
-    parser.add_argument("--seed", type=int, default=1, help="of the first machine")
+    parser.add_argument(
+        "--seed", type=int, default=1, help="of the first machine"
+    )
     parser.add_argument("--machines", type=int, default=4)
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.machines)

@@ -9,7 +9,9 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
-from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.reading import (
+    read_trajectory_files,
+)
 from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.2, 0.7, 0.3, -1.2, 0.6]))
@@ -72,10 +74,13 @@ def smooth_poses(times_s):
     return se3.exp(np.sin(phases) * amplitudes)
 
 
-def as_trajectory(poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames):
+def as_trajectory(
+    poses, rate_hz=10.0, start_ns=1_700_000_000_000_000_000, **frames
+):
     """Poses at a steady rate."""
     return Trajectory(
-        start_ns + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64),
+        start_ns
+        + np.round(np.arange(len(poses)) * 1e9 / rate_hz).astype(np.int64),
         poses,
         **frames,
     )
@@ -85,7 +90,8 @@ def noisy_pair(poses, seed, *noise, rate_hz=10.0, mount=T_PARENT_CHILD):
     """Both trajectories, each with white noise (m, rad) of its own."""
     both = enumerate((poses, child_of(poses, mount)), start=seed)
     return [
-        as_trajectory(disturbed(poses, own, *noise), rate_hz) for own, poses in both
+        as_trajectory(disturbed(poses, own, *noise), rate_hz)
+        for own, poses in both
     ]
 
 
@@ -133,6 +139,6 @@ def geodetic(positions, origin):
 
 def read_trajectory_file(path, format="tum", **options):
     """A file as the command line reads it: with what was repaired and guessed."""
-    return read_trajectory_files([(Path(path), FileOptions(format=format, **options))])[
-        0
-    ]
+    return read_trajectory_files(
+        [(Path(path), FileOptions(format=format, **options))]
+    )[0]

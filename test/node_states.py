@@ -3,7 +3,11 @@
 import time
 from dataclasses import replace
 
-from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
+from hand_eye_calib.online.live.progress import (
+    AXIS_KEYS,
+    AxisProgress,
+    Progress,
+)
 from hand_eye_calib.online.live.state import (
     Broadcast,
     ChecksState,
@@ -33,7 +37,10 @@ EXTRINSIC = ExtrinsicState(
     tf_static=Broadcast.OFF, tf_static_reason="", result=RESULT,
 )  # fmt: skip
 CAREFUL = replace(
-    RESULT, verdict="USE WITH CARE", caution="z might be wrong", step="Measure it."
+    RESULT,
+    verdict="USE WITH CARE",
+    caution="z might be wrong",
+    step="Measure it.",
 )
 ROTATION = AxisProgress(sigma=0.001, target=0.00524, seconds_left=0.0)
 KNOWN = AxisProgress(sigma=0.004, target=0.02, seconds_left=0.0)
@@ -49,11 +56,17 @@ MOUNT = MountState(level=Level.OK, text="it has not", seconds_of_motion=200)
 
 
 FULL = JournalState(level=Level.ERROR, text="cannot write", directory="")
-SAVED = SavedState(directory="/home/live", at_s=time.time(), text="USE: all six axes")
+SAVED = SavedState(
+    directory="/home/live", at_s=time.time(), text="USE: all six axes"
+)
 
 
 def inputs(parent=Level.OK, child=Level.OK):
-    texts = ["20.0 Hz", "/odom has been silent for 3 s", "/odom: bad quaternion"]
+    texts = [
+        "20.0 Hz",
+        "/odom has been silent for 3 s",
+        "/odom: bad quaternion",
+    ]
     figures = dict.fromkeys(("rate_hz", "longest_gap_s"), 0.0)
     figures |= dict.fromkeys(("messages", "poses_taken", "lost"), 0)
     return {

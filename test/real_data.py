@@ -62,7 +62,9 @@ def tango_pairs():
     }
     return [
         _of_rig("asl_tango_easy", name, name, offset, scale)
-        for (name, offset), scale in zip(offsets.items(), _TANGO_SCALES, strict=True)
+        for (name, offset), scale in zip(
+            offsets.items(), _TANGO_SCALES, strict=True
+        )
     ]
 
 
@@ -111,7 +113,9 @@ def eye_to_hand():
     """Poses (50, 4, 4) of an arm's base in its hand and of a target on the hand in a fixed camera's
     view, both inverse: MoveIt's samples.
     """
-    path = data_folder() / "independent" / "moveit_samples" / "pose_samples.json"
+    path = (
+        data_folder() / "independent" / "moveit_samples" / "pose_samples.json"
+    )
     if not path.exists():
         pytest.skip(f"{path} is absent")
     samples = json.loads(path.read_text(encoding="utf-8"))
@@ -177,7 +181,9 @@ def kitti(which):
     "short" or "long".
     """
     scale = _KITTI_LONG_SCALE if which == "long" else 1.0
-    return _of_rig("valimaki2023", f"kitti_{which}", f"kitti {which}", 0.0, scale)
+    return _of_rig(
+        "valimaki2023", f"kitti_{which}", f"kitti {which}", 0.0, scale
+    )
 
 
 def all_recordings():

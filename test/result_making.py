@@ -75,7 +75,9 @@ def shifted(shift=(0,) * 6, hidden="", sigmas=SIGMAS, seed=None, **fields):
     covariance = to_child @ variances @ to_child.T
     fields.setdefault("status", SolveStatus.OK)
     fields.setdefault("observability_measured", dofs(sigmas, [hidden]))
-    return calibration(T_parent_child=T, covariance_measured=covariance, **fields)
+    return calibration(
+        T_parent_child=T, covariance_measured=covariance, **fields
+    )
 
 
 def shift(axis, size):

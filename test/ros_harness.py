@@ -18,7 +18,11 @@ import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+)
 from motions import disturbed
 from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
@@ -38,7 +42,12 @@ from hand_eye_calib.online.ros import conversions
 PATIENCE_S = 300.0
 
 T_PARENT_CHILD = se3.exp(np.array([0.4, -0.3, 0.2, 1.1, -0.7, 0.5]))
-POSE_KINDS = (Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped)
+POSE_KINDS = (
+    Odometry,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+)
 START_NS = 1_700_000_000_000_000_000
 
 LATCHED = QoSProfile(
@@ -69,14 +78,18 @@ def free_domain():
             try:
                 probe.bind(("", 7410 + 250 * domain))
                 # Held for a while: the tests may run in two interpreters at once.
-                _held[candidate % 10] = socket.create_server(("", 7410 + 250 * domain))
+                _held[candidate % 10] = socket.create_server(
+                    ("", 7410 + 250 * domain)
+                )
             except OSError:
                 continue
         return domain
     raise RuntimeError("no free ROS domain")
 
 
-def drive(n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5):
+def drive(
+    n_poses=120, period_ns=100_000_000, start_ns=START_NS, sigma_rad=5e-5
+):
     """Stamps and poses of both sensors on a rig that turns about all axes. Without noise they would
     be one stream computed from the other.
     """
@@ -196,7 +209,9 @@ class NodeProcess:
                 "-p report:=false",
             ]
         words = [
-            word for argument in ros_arguments for word in str(argument).split(" ", 1)
+            word
+            for argument in ros_arguments
+            for word in str(argument).split(" ", 1)
         ]
         arguments = ["calibrator", "--ros-args", *words]
         source = str(Path(hand_eye_calib.__file__).parents[1])
@@ -230,7 +245,9 @@ class NodeProcess:
         """Wait until the log has all texts; returns the log."""
         end = time.monotonic() + PATIENCE_S
         while not all(text in self.log for text in texts):
-            assert time.monotonic() < end, f"no {texts} in the node's log:\n{self.log}"
+            assert time.monotonic() < end, (
+                f"no {texts} in the node's log:\n{self.log}"
+            )
             assert may_have_ended or self.process.poll() is None, (
                 f"the node ended with {self.process.returncode}:\n{self.log}"
             )
@@ -290,7 +307,9 @@ class Peer:
     def publisher(self, kind, topic):
         """Publisher that keeps all it is given until a reliable subscription has it."""
         return self.node.create_publisher(
-            kind, topic, QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+            kind,
+            topic,
+            QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE),
         )
 
     def publishers(self, kind=Odometry, child_kind=None):
@@ -301,7 +320,9 @@ class Peer:
 
     def wait_matched(self, *publishers):
         self.spin_until(
-            lambda: all(publisher.get_subscription_count() for publisher in publishers),
+            lambda: all(
+                publisher.get_subscription_count() for publisher in publishers
+            ),
             "the node to subscribe",
         )
 
@@ -309,12 +330,22 @@ class Peer:
         """Wait until a node that has ended is forgotten: what is published before that is lost."""
         self.spin_until(
             lambda: (
-                not any(publisher.get_subscription_count() for publisher in publishers)
+                not any(
+                    publisher.get_subscription_count()
+                    for publisher in publishers
+                )
             ),
             "the node to leave",
         )
 
-    def feed(self, publishers, stamps_ns, Ts_pw_p, Ts_cw_c, frames=("lidar", "camera")):
+    def feed(
+        self,
+        publishers,
+        stamps_ns,
+        Ts_pw_p,
+        Ts_cw_c,
+        frames=("lidar", "camera"),
+    ):
         """Publish both trajectories, interleaved."""
         self.wait_matched(*publishers)
         for stamp_ns, poses in zip(
@@ -348,7 +379,9 @@ class Peer:
     def ask(self, kind, name, request=None):
         """Future of a service's answer."""
         if name not in self._clients:
-            self._clients[name] = self.node.create_client(kind, f"{self.target}/{name}")
+            self._clients[name] = self.node.create_client(
+                kind, f"{self.target}/{name}"
+            )
         client = self._clients[name]
         self.spin_until(client.service_is_ready, f"service {name}")
         return client.call_async(request or kind.Request())
@@ -396,14 +429,19 @@ class Peer:
         def solved():
             answers.append(self.trigger("solve"))
             self._executor.spin_once(timeout_sec=0.05)
-            return extrinsics and ns_of(extrinsics[-1].header.stamp) >= stamps_ns[-1]
+            return (
+                extrinsics
+                and ns_of(extrinsics[-1].header.stamp) >= stamps_ns[-1]
+            )
 
         def refused():
             """The answer that comes again and again, if it forbids to publish a result."""
             newest = [answer.message for answer in answers[-3:]]
             is_settled = len(newest) == 3 and len(set(newest)) == 1
             return (
-                newest[0] if is_settled and newest[0].startswith("DO NOT USE") else ""
+                newest[0]
+                if is_settled and newest[0].startswith("DO NOT USE")
+                else ""
             )
 
         self.spin_until(solved, "a result with the last pose", refused)

@@ -12,7 +12,9 @@ from hand_eye_calib.online.watch.headline import (
 from hand_eye_calib.online.watch.view import Tone
 
 # Words of parameters, topics and algorithms, which a driver does not know.
-JARGON = r"\bpriors?\b|max_gap|tf_static|synchronised|xyz =|adaptive|\bpairs\b|->"
+JARGON = (
+    r"\bpriors?\b|max_gap|tf_static|synchronised|xyz =|adaptive|\bpairs\b|->"
+)
 
 # Verbs of next steps. Every screen that requires a person has one of them.
 STEPS = (
@@ -21,12 +23,18 @@ STEPS = (
 )
 
 # Times left: of the drive, and of the confirmation.
-TIMES_LEFT = r"(?:about|Confirming,) [\d.]+ (?:s|min|h)\b|[\d.]+ (?:s|min|h) left"
+TIMES_LEFT = (
+    r"(?:about|Confirming,) [\d.]+ (?:s|min|h)\b|[\d.]+ (?:s|min|h) left"
+)
 
 
 def sentences_of(view):
     """Return the sentences of a headline."""
-    return [text for text in re.split(r"(?<=[.!?]) |(?<=[A-Z]:) ", view.text) if text]
+    return [
+        text
+        for text in re.split(r"(?<=[.!?]) |(?<=[A-Z]:) ", view.text)
+        if text
+    ]
 
 
 def faults_of(view, state):
@@ -75,7 +83,11 @@ def _faults_of_the_verdict(view, state):
     if evidence and verdict != "USE":
         yield f"{verdict} beside evidence with the tone of success"
     saved = [line.tone for line in view.result if line.name == "saved"]
-    if view.word == "ENDED" and view.tone is not Tone.GOOD and Tone.GOOD in saved:
+    if (
+        view.word == "ENDED"
+        and view.tone is not Tone.GOOD
+        and Tone.GOOD in saved
+    ):
         yield "the end is no success, the saved result is"
 
 
@@ -108,12 +120,16 @@ def _faults_of_the_motion(view, state):
         yield f"START after {extrinsic.motion_s:.0f} s of motion"
     is_early = extrinsic.motion_s < 20.0 and not state.result
     has_advice = "cannot be determined" in view.text
-    if is_early and (has_advice or view.word in (CHANGE_MOTION, CHANGE_TARGET, DONE)):
+    if is_early and (
+        has_advice or view.word in (CHANGE_MOTION, CHANGE_TARGET, DONE)
+    ):
         yield f"advice after {extrinsic.motion_s:.0f} s of motion: {view.text}"
     is_full = [bar.share >= 1.0 for bar in view.bars]
     if (view.word == DONE or "Confirming" in view.text) and not all(is_full):
         yield f"{view.text} with a bar that is not full"
-    if state.progress.progress.is_faulty and any(bar.share for bar in view.bars):
+    if state.progress.progress.is_faulty and any(
+        bar.share for bar in view.bars
+    ):
         yield "bars of faulty streams look good"
     words = {bar.word for bar in view.bars}
     if "motion is right" in view.text and "not with this motion" in words:
@@ -124,11 +140,14 @@ def _faults_of_inputs(view, state):
     tones = {line.name: line.tone for line in view.health}
     for name, stream in state.inputs.items():
         lacks = re.search(
-            rf"[Nn]o (?:poses?|message)[^.]*\b(?:{name}|{stream.topic})\b", view.text
+            rf"[Nn]o (?:poses?|message)[^.]*\b(?:{name}|{stream.topic})\b",
+            view.text,
         )
         if lacks and tones.get(f"{name} input") is Tone.GOOD:
             yield f"{lacks[0]}, and the input is good"
-        if view.topics and any(topic.startswith(stream.topic) for topic in view.topics):
+        if view.topics and any(
+            topic.startswith(stream.topic) for topic in view.topics
+        ):
             yield f"{stream.topic} is displayed twice, with other facts"
     is_paused = any(stream.is_paused for stream in state.inputs.values())
     if is_paused and re.search(r"result .* old", view.facts):

@@ -25,7 +25,9 @@ def homography_of(T_camera_picture):
     to_metres = np.diag([1 / PIXELS_PER_M, 1 / PIXELS_PER_M, 1.0])
     to_metres[:2, 2] = 0.5 / PIXELS_PER_M
     half_pixel = (SUPER - 1) / 2
-    to_fine = np.array([[SUPER, 0, half_pixel], [0, SUPER, half_pixel], [0, 0, 1.0]])
+    to_fine = np.array(
+        [[SUPER, 0, half_pixel], [0, SUPER, half_pixel], [0, 0, 1.0]]
+    )
     to_camera = T_camera_picture[:3, [0, 1, 3]]
     return to_fine @ MATRIX @ to_camera @ to_metres
 
@@ -34,7 +36,11 @@ def rendered(picture, T_camera_picture, rng):
     """A grey image of a flat picture, whose pixels are in metres along x and down along y."""
     homography = homography_of(T_camera_picture)
     height, width = picture.shape
-    corners = homography @ [[0, width, 0, width], [0, 0, height, height], [1, 1, 1, 1]]
+    corners = homography @ [
+        [0, width, 0, width],
+        [0, 0, height, height],
+        [1, 1, 1, 1],
+    ]
     pixels = corners[:2] / corners[2] / SUPER
     left, top = np.clip(pixels.min(axis=1) - 2, 0, SIZE).astype(int)
     right, bottom = np.clip(pixels.max(axis=1) + 3, 0, SIZE).astype(int)
@@ -44,7 +50,9 @@ def rendered(picture, T_camera_picture, rng):
 
     look = cv2.INTER_AREA
     size = (SUPER * columns, SUPER * rows)
-    fine = cv2.warpPerspective(picture, homography, size, flags=look, borderValue=200)
+    fine = cv2.warpPerspective(
+        picture, homography, size, flags=look, borderValue=200
+    )
     coarse = cv2.resize(fine, (columns, rows), interpolation=look)
     # Grey beside the picture.
     image = np.full(SIZE[::-1], 200, np.uint8)
@@ -58,21 +66,26 @@ def charuco_picture():
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     board = cv2.aruco.CharucoBoard((columns, rows), square, marker, dictionary)
     return board.generateImage(
-        (round(columns * square * PIXELS_PER_M), round(rows * square * PIXELS_PER_M))
+        (
+            round(columns * square * PIXELS_PER_M),
+            round(rows * square * PIXELS_PER_M),
+        )
     )
 
 
 def aprilgrid_picture(columns, rows, size, gap):
     """As Kalibr prints it: from the lower left tag on, upright, with a border of two bits."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    dictionary = cv2.aruco.getPredefinedDictionary(
+        cv2.aruco.DICT_APRILTAG_36h11
+    )
     side = round(size * PIXELS_PER_M)
     step = round((size + gap) * PIXELS_PER_M)
     picture = np.full((rows * step, columns * step), 255, dtype=np.uint8)
     for number in range(columns * rows):
         # OpenCV draws the tags of this family upside down.
-        tag = cv2.aruco.generateImageMarker(dictionary, number, side, borderBits=2)[
-            ::-1, ::-1
-        ]
+        tag = cv2.aruco.generateImageMarker(
+            dictionary, number, side, borderBits=2
+        )[::-1, ::-1]
         left = number % columns * step
         bottom = picture.shape[0] - number // columns * step
         picture[bottom - side : bottom, left : left + side] = tag

@@ -49,7 +49,9 @@ def ratios(rows, memory):
             if slow:
                 found[f"{other} / {name}, {size}"] = slow / own
     for size, (before, peak, data) in memory.items():
-        found[f"memory of the pairs / of solving them, {size}"] = data / (peak - before)
+        found[f"memory of the pairs / of solving them, {size}"] = data / (
+            peak - before
+        )
     return found
 
 
@@ -99,12 +101,22 @@ def aims(rows, memory):
     measured = ratios(rows, memory)
     seconds = {row.key: row.seconds for row in rows}
     found = [
-        (name, f"at least {aim:g}", f"{measured[name]:.3g}", measured[name] >= aim)
+        (
+            name,
+            f"at least {aim:g}",
+            f"{measured[name]:.3g}",
+            measured[name] >= aim,
+        )
         for name, aim in _AT_LEAST.items()
         if name in measured
     ]
     found += [
-        (name, f"below {aim:g} s", f"{seconds[name]:.3g} s", seconds[name] < aim)
+        (
+            name,
+            f"below {aim:g} s",
+            f"{seconds[name]:.3g} s",
+            seconds[name] < aim,
+        )
         for name, aim in _BELOW_S.items()
         if name in seconds
     ]
@@ -113,6 +125,11 @@ def aims(rows, memory):
             peak = memory[size][1]
             text = f"{peak / 1e9:.2f} GB"
             found.append(
-                (f"peak memory, {size}", f"below {most / 1e9:g} GB", text, peak < most)
+                (
+                    f"peak memory, {size}",
+                    f"below {most / 1e9:g} GB",
+                    text,
+                    peak < most,
+                )
             )
     return [[*line, "yes" if is_met else "no"] for *line, is_met in found]

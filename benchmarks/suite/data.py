@@ -56,13 +56,17 @@ def drives(sizes):
     """Source of the two drives of published lengths, and a Drive for every number of pairs."""
     found = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
     shared = Path(__file__).resolve().parents[3] / "shared" / "data"
-    folder = Path(os.environ.get("HAND_EYE_CALIB_DATA", shared)) / "valimaki2023"
+    folder = (
+        Path(os.environ.get("HAND_EYE_CALIB_DATA", shared)) / "valimaki2023"
+    )
     try:
         cases = {SHORT: load_kitti_short(folder), LONG: load_kitti_long(folder)}
     except InputError:
         return "simulated", found
     for size, case in cases.items():
-        poses = PosePairs(case.parent.stamps_ns, case.parent.poses, case.child.poses)
+        poses = PosePairs(
+            case.parent.stamps_ns, case.parent.poses, case.child.poses
+        )
         found[size] = Drive(poses, case.T_parent_child)
     return "published", found
 
@@ -74,17 +78,27 @@ def messages(first, count, rate_hz):
     numbers = first + np.arange(count)
     s = numbers / rate_hz
     turns = np.stack(
-        [0.3 * np.sin(0.7 * s), 0.2 * np.sin(0.9 * s + 1.0), 1.2 * np.sin(0.1 * s)],
+        [
+            0.3 * np.sin(0.7 * s),
+            0.2 * np.sin(0.9 * s + 1.0),
+            1.2 * np.sin(0.1 * s),
+        ],
         axis=1,
     )
     places = np.stack(
-        [20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)], axis=1
+        [20 * np.sin(0.05 * s), 20 * np.sin(0.07 * s), 0.5 * np.cos(0.8 * s)],
+        axis=1,
     )
     Ts_pw_p = se3.from_rotation_translation(se3.rotation_exp(turns), places)
-    noise = np.random.default_rng(first).normal(size=(2, count, 6)) * _SIGMA_OF_MESSAGES
+    noise = (
+        np.random.default_rng(first).normal(size=(2, count, 6))
+        * _SIGMA_OF_MESSAGES
+    )
     stamps_ns = START_NS + numbers * round(1e9 / rate_hz)
     return (
-        Trajectory(stamps_ns, Ts_pw_p @ se3.exp(noise[0]), "parent_sensor", "world"),
+        Trajectory(
+            stamps_ns, Ts_pw_p @ se3.exp(noise[0]), "parent_sensor", "world"
+        ),
         Trajectory(
             stamps_ns,
             Ts_pw_p @ T_PARENT_CHILD @ se3.exp(noise[1]),
@@ -125,7 +139,9 @@ def simulated_drive(n_poses, seed=0):
         yaw = 1.5 * np.sin(0.11 * s)
         roll = 0.05 * np.sin(0.7 * s)
         pitch = 0.06 * np.sin(1.1 * s)
-        about_z = np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1)
+        about_z = np.stack(
+            [np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=1
+        )
         rotations = se3.rotation_exp(about_z) @ se3.rotation_exp(
             np.stack([roll, pitch, np.zeros_like(yaw)], axis=1)
         )
@@ -141,6 +157,8 @@ def simulated_drive(n_poses, seed=0):
         Ts = se3.from_rotation_translation(rotations, places)
         noise = se3.exp(random.normal(size=(2, len(Ts), 6)) * _SIGMA)
         Ts_pw_p[part] = Ts @ noise[0]
-        Ts_cw_c[part] = se3.inverse(T_PARENT_CHILD) @ Ts @ T_PARENT_CHILD @ noise[1]
+        Ts_cw_c[part] = (
+            se3.inverse(T_PARENT_CHILD) @ Ts @ T_PARENT_CHILD @ noise[1]
+        )
         Ts_cw_c[part, :3, 3] += shifts
     return Drive(PosePairs(stamps_ns, Ts_pw_p, Ts_cw_c), T_PARENT_CHILD)

@@ -96,5 +96,9 @@ def row_of(name, size, times):
     """Row for times that have been taken elsewhere, in seconds."""
     median = float(np.median(times))
     return Row(
-        name, size, median, float(max(times) - min(times)) / (2 * median), len(times)
+        name,
+        size,
+        median,
+        float(max(times) - min(times)) / (2 * median),
+        len(times),
     )

@@ -46,16 +46,24 @@ def process_rows(drives):
     """From two TUM files, and from a bag, to the result with covariance; the time until the command
     line shows its help.
     """
-    compileall.compile_dir(PROJECT / "hand_eye_calib", quiet=1)  # as pip installs it
+    compileall.compile_dir(
+        PROJECT / "hand_eye_calib", quiet=1
+    )  # as pip installs it
     calibrate = [sys.executable, "-m", "hand_eye_calib", "calibrate"]
     with tempfile.TemporaryDirectory() as folder:
-        files = [str(Path(folder, name)) for name in ("parent.txt", "child.txt")]
-        for file, trajectory in zip(files, drives[LONG].trajectories(), strict=True):
+        files = [
+            str(Path(folder, name)) for name in ("parent.txt", "child.txt")
+        ]
+        for file, trajectory in zip(
+            files, drives[LONG].trajectories(), strict=True
+        ):
             write_trajectory(file, trajectory)
         bag = Path(folder, "bag")
         write_messages(bag, MESSAGES)
         sources = [
-            word for pair in zip(_TOPIC_OPTIONS, TOPICS, strict=True) for word in pair
+            word
+            for pair in zip(_TOPIC_OPTIONS, TOPICS, strict=True)
+            for word in pair
         ]
         commands = {
             (NUMPY, 0): [sys.executable, "-c", "import numpy"],
@@ -106,6 +114,8 @@ def memory(sizes):
     for size in sizes:
         command = [sys.executable, "-c", _MEMORY, str(size)]
         options = dict(capture_output=True, text=True, check=True)
-        done = subprocess.run(command, **options, env=os.environ | {"PYTHONPATH": path})
+        done = subprocess.run(
+            command, **options, env=os.environ | {"PYTHONPATH": path}
+        )
         found[size] = tuple(map(int, done.stdout.split()))
     return found

@@ -1,5 +1,6 @@
 """Rows measured within this process: from synchronised poses to the answer, the engine, bags."""
 
+import functools
 import sys
 import tempfile
 import time
@@ -45,12 +46,16 @@ def solver_rows(drive, is_full):
         return (
             measured
             if answer is None
-            else judged(measured, answer(result), getattr(result, "objective", None))
+            else judged(
+                measured, answer(result), getattr(result, "objective", None)
+            )
         )
 
     def judged(measured, T_parent_child, objective):
         metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
-        return replace(measured, objective=objective, error_m=metres, error_rad=radians)
+        return replace(
+            measured, objective=objective, error_m=metres, error_rad=radians
+        )
 
     def solved(method, backend="fast"):
         return lambda: Method(method, backend=backend).solve(pairs)
@@ -59,16 +64,21 @@ def solver_rows(drive, is_full):
         return result.T_parent_child
 
     yield row(
-        FLOOR, lambda: pairs.Ts_parenti_parentj.sum() + pairs.Ts_childi_childj.sum()
+        FLOOR,
+        lambda: pairs.Ts_parenti_parentj.sum() + pairs.Ts_childi_childj.sum(),
     )
-    yield row("pairs", lambda: motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, REFERENCE))
+    yield row(
+        "pairs", lambda: motion_pairs(poses.Ts_pw_p, poses.Ts_cw_c, REFERENCE)
+    )
     yield row("condense", lambda: quadratic_form.condense(pairs))
     for method in ("dnl", "dnlo"):
         fast = (f"{method} fast", solved(method))
         if size in (SHORT, LONG):
             slow = (f"{method} ipopt", solved(method, "ipopt"))
             for measured, solution in measure_in_turn(size, slow, fast):
-                yield judged(measured, solution.T_parent_child, solution.objective)
+                yield judged(
+                    measured, solution.T_parent_child, solution.objective
+                )
         else:
             yield row(*fast, extrinsic)
     if size <= most["other methods"]:
@@ -82,16 +92,22 @@ def solver_rows(drive, is_full):
             lambda: assess(
                 pairs,
                 solution,
-                lambda left_out: method.solve_without(pairs, solution, left_out),
+                lambda left_out: method.solve_without(
+                    pairs, solution, left_out
+                ),
             ),
         )
     if size <= most["adaptive"]:
         yield row(
             "adaptive",
-            lambda: estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c),
+            lambda: estimator.solve(
+                poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c
+            ),
             extrinsic,
         )
-        yield row("reference auto", lambda: select_reference(poses, Method("dnlo")))
+        yield row(
+            "reference auto", lambda: select_reference(poses, Method("dnlo"))
+        )
 
 
 def opencv_rows(drives):
@@ -122,7 +138,9 @@ def opencv_rows(drives):
         quickest = min(found, key=lambda row: row.seconds)
         yield replace(quickest, name=OPENCV)
         methods = [
-            method for method in methods if quickest.name == f"opencv {method.lower()}"
+            method
+            for method in methods
+            if quickest.name == f"opencv {method.lower()}"
         ]
 
 
@@ -152,10 +170,14 @@ def engine_rows(n_messages):
     for pose in range(n_messages // 2):
         for stream, (stamps_ns, positions, quats) in streams.items():
             start = time.perf_counter_ns()
-            calibrator.add_pose(stream, stamps_ns[pose], positions[pose], quats[pose])
+            calibrator.add_pose(
+                stream, stamps_ns[pose], positions[pose], quats[pose]
+            )
             times.append((time.perf_counter_ns() - start) * 1e-9)
     fifths = np.array_split(times, 5)
-    yield row_of("add_pose, median", n_messages, [np.median(part) for part in fifths])
+    yield row_of(
+        "add_pose, median", n_messages, [np.median(part) for part in fifths]
+    )
     tails = [np.percentile(part, 99) for part in fifths]
     yield row_of("add_pose, 99th percentile", n_messages, tails)
 
@@ -170,8 +192,16 @@ def bag_rows(n_messages):
                 folder, "recording.bag" if storage == "rosbag1" else "recording"
             )
             write_messages(path, n_messages, storage)
-            for name, work in (("rosbags alone", _by_rosbags), ("bag: read", _by_us)):
-                yield measure(f"{name}, {storage}", n_messages, lambda: work(path))[0]  # noqa: B023
+            for name, work in (
+                ("rosbags alone", _by_rosbags),
+                ("bag: read", _by_us),
+            ):
+                row, _ = measure(
+                    f"{name}, {storage}",
+                    n_messages,
+                    functools.partial(work, path),
+                )
+                yield row
 
 
 def write_messages(path, n_messages, storage="mcap"):

@@ -29,7 +29,10 @@ def tables(source, rows, memory):
     sizes = {row.size for row in rows if row.name == FLOOR}
     of_pairs = [row for row in rows if row.size in sizes]
     found = [
-        _growth(source, [row for row in of_pairs if not row.name.startswith("opencv")])
+        _growth(
+            source,
+            [row for row in of_pairs if not row.name.startswith("opencv")],
+        )
     ]
     for size, name in ((SHORT, "short"), (LONG, "long")):
         found.append(
@@ -38,8 +41,13 @@ def tables(source, rows, memory):
                 [row for row in of_pairs if row.size == size],
             )
         )
-    found.append(_others([row for row in rows if row.size not in sizes], memory))
-    return [*found, Table("Aims", ["aim", "measured", "met"], aims(rows, memory))]
+    found.append(
+        _others([row for row in rows if row.size not in sizes], memory)
+    )
+    return [
+        *found,
+        Table("Aims", ["aim", "measured", "met"], aims(rows, memory)),
+    ]
 
 
 def show(found):
@@ -69,12 +77,16 @@ def write(found, page, note):
             f"### {each.title}\n\n"
             + "".join(f"| {' | '.join(line)} |\n" for line in lines)
         )
-    page.write_text(before + "\n".join([*parts, _END]) + after, encoding="utf-8")
+    page.write_text(
+        before + "\n".join([*parts, _END]) + after, encoding="utf-8"
+    )
 
 
 def _readable(seconds):
     """A time in three digits."""
-    size, unit = next((unit for unit in _UNITS if seconds >= unit[0]), _UNITS[-1])
+    size, unit = next(
+        (unit for unit in _UNITS if seconds >= unit[0]), _UNITS[-1]
+    )
     return f"{seconds / size:.3g} {unit}"
 
 
@@ -118,11 +130,16 @@ def _side_by_side(title, rows):
 
 def _others(rows, memory):
     lines = [
-        [row.name, f"{row.size:,}" if row.size else "", _cell(row)] for row in rows
+        [row.name, f"{row.size:,}" if row.size else "", _cell(row)]
+        for row in rows
     ]
     for size, (before, peak, data) in memory.items():
         of_what = f"of which {before / 1e6:.0f} before the solve, {data / 1e6:.0f} for the pairs"
         lines.append(
-            ["peak memory of dnlo fast", f"{size:,}", f"{peak / 1e6:.0f} MB, {of_what}"]
+            [
+                "peak memory of dnlo fast",
+                f"{size:,}",
+                f"{peak / 1e6:.0f} MB, {of_what}",
+            ]
         )
     return Table("Processes, bags, messages", ["size", "measured"], lines)

@@ -29,7 +29,16 @@ from hand_eye_calib.formats.results import launch_text, xacro_text
 # Beginnings of words in the names of frames, by the kind of sensor. The kinds are sorted by their
 # usual place on a vehicle: the base first, then sensors that other sensors are calibrated to.
 _ROLES = {
-    "base": ("base", "ego", "vehicle", "chassis", "rig", "hand", "tool", "flange"),
+    "base": (
+        "base",
+        "ego",
+        "vehicle",
+        "chassis",
+        "rig",
+        "hand",
+        "tool",
+        "flange",
+    ),
     "imu": ("imu", "body", "gyro", "ins", "novatel", "xsens"),
     "lidar": (
         "lidar",
@@ -128,7 +137,9 @@ def formats() -> dict[str, list[Layout]]:
 
 def role_of(frame: str) -> str:
     """Return the kind of a sensor, judged by the name of its frame; empty for other names."""
-    words = re.findall("[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower())
+    words = re.findall(
+        "[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower()
+    )
     roles = [
         role
         for role, beginnings in _ROLES.items()
@@ -152,7 +163,9 @@ def arranged(
     best_score: tuple[Any, ...] = ()
     for index, layout in enumerate(layouts):
         directions = (
-            (False, True) if layout.is_inverted is None else (layout.is_inverted,)
+            (False, True)
+            if layout.is_inverted is None
+            else (layout.is_inverted,)
         )
         for is_inverted in directions:
             # Kinds of the parent and of the child in this direction; empty for any kind.
@@ -161,7 +174,9 @@ def arranged(
                 kinds = (layout.source, layout.target)
             pairs = list(zip(kinds, roles, strict=True))
             n_matches = sum(kind == role != "" for kind, role in pairs)
-            n_contradictions = sum(kind not in ("", role) for kind, role in pairs)
+            n_contradictions = sum(
+                kind not in ("", role) for kind, role in pairs
+            )
             is_usual_order = _RANKS.get(kinds[0], 0) <= _RANKS.get(kinds[1], 0)
             score = (n_matches, -n_contradictions, -index, is_usual_order)
             if score > best_score:
@@ -206,7 +221,9 @@ def _filled_layout(result: Judged, name: str) -> str:
     if layout.is_inverted is False and not layout.target:
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]
-    if unknown := [axis for axis in result.unobservable() if axis in layout.axes]:
+    if unknown := [
+        axis for axis in result.unobservable() if axis in layout.axes
+    ]:
         raise InputError(
             "no file is written: this recording does not determine "
             f"{axes_in_words(unknown)}; measure it by hand and calibrate again with a prior"
@@ -244,24 +261,40 @@ def _robot_frames(target: str) -> dict[str, str]:
     """
     if "base" in target.lower():
         # The camera does not move with the hand.
-        return {"eye": "eye_on_base", "robot": json.dumps(target), "effector": '"hand"'}
-    return {"eye": "eye_in_hand", "robot": '"base"', "effector": json.dumps(target)}
+        return {
+            "eye": "eye_on_base",
+            "robot": json.dumps(target),
+            "effector": '"hand"',
+        }
+    return {
+        "eye": "eye_in_hand",
+        "robot": '"base"',
+        "effector": json.dumps(target),
+    }
 
 
 def _delay_of_px4(delay_ms: float) -> str:
     """Return the command that sets a delay in PX4; a comment if the delay is out of range."""
     if 0 <= delay_ms <= _MAX_DELAY_MS:
         return f"param set EKF2_EV_DELAY {_number(round(delay_ms, 3))}"
-    return f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 accepts 0 to 300 ms"
+    return (
+        f"# EKF2_EV_DELAY would be {delay_ms:.1f} ms; PX4 accepts 0 to 300 ms"
+    )
 
 
 def _remarks(
-    result: Judged, name: str, arrangement: Arrangement, target: str, source: str
+    result: Judged,
+    name: str,
+    arrangement: Arrangement,
+    target: str,
+    source: str,
 ) -> list[str]:
     """Return remarks for the user of a file: direction, clocks, assumptions and axes."""
     layout = arrangement.layout
     sign = "-" if result.time_offset_s < 0 else "+"
-    origin = "estimated" if result.time_offset_sigma_s else "given, not estimated"
+    origin = (
+        "estimated" if result.time_offset_sigma_s else "given, not estimated"
+    )
     lines = [
         f"{name}, by hand_eye_calib {version_of()}. {result.headline}.",
         f"Maps coordinates of {source} into {target}: the pose of {source} in {target}.",
@@ -269,10 +302,14 @@ def _remarks(
         f"{sign} {_number(abs(result.time_offset_s))} s, {origin}.",
     ]
     if arrangement.is_inverted:
-        lines.append(f"Inverted: the calibration is the pose of {target} in {source}.")
+        lines.append(
+            f"Inverted: the calibration is the pose of {target} in {source}."
+        )
     if not arrangement.is_certain:
         kinds = ((target, layout.target), (source, layout.source))
-        assumed = ", ".join(f"{frame} is the {kind}" for frame, kind in kinds if kind)
+        assumed = ", ".join(
+            f"{frame} is the {kind}" for frame, kind in kinds if kind
+        )
         lines.append(
             f"Assumed, because the names of the frames do not contain it: {assumed}."
         )

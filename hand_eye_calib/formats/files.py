@@ -90,9 +90,14 @@ def reading_memory() -> Iterator[None]:
         limits = resource.getrlimit(resource.RLIMIT_AS)
         _before.append(limits)
         # The limit of the system is for virtual memory: the first number of statm, in pages.
-        largest = int(_STATM.read_text().split()[0]) * resource.getpagesize() + LARGEST
+        largest = (
+            int(_STATM.read_text().split()[0]) * resource.getpagesize()
+            + LARGEST
+        )
         allowed = [limit for limit in limits if limit != resource.RLIM_INFINITY]
-        resource.setrlimit(resource.RLIMIT_AS, (min([largest, *allowed]), limits[1]))
+        resource.setrlimit(
+            resource.RLIMIT_AS, (min([largest, *allowed]), limits[1])
+        )
     try:
         yield
     finally:
@@ -116,7 +121,9 @@ def local_path(source: str | Path) -> Path:
     samples = sorted(path.name for path in _SAMPLES.iterdir())
     if name not in samples:
         wanted = printable(str(source))
-        raise InputError(f"there is no {wanted}; the samples are {', '.join(samples)}")
+        raise InputError(
+            f"there is no {wanted}; the samples are {', '.join(samples)}"
+        )
     return _SAMPLES / name
 
 
@@ -158,7 +165,9 @@ def open_regular(path: str | Path) -> BufferedReader:
     """
     try:
         file = open(  # noqa: SIM115
-            path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)
+            path,
+            "rb",
+            opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK),
         )
     # A path with a zero byte raises a ValueError.
     except (OSError, ValueError) as error:
@@ -184,7 +193,9 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
     """
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > largest:
-            raise InputError(f"cannot read {path}: it is larger than {largest} bytes")
+            raise InputError(
+                f"cannot read {path}: it is larger than {largest} bytes"
+            )
         return file.read()
 
 
@@ -204,7 +215,9 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected {expected}") from None
+        raise InputError(
+            f"{path}: not a text file; expected {expected}"
+        ) from None
 
 
 @contextmanager
@@ -240,7 +253,9 @@ def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
         for path, temporary in temporaries.items():
             content = contents[path]
             with open(temporary, "xb") as file:
-                file.write(content.encode() if isinstance(content, str) else content)
+                file.write(
+                    content.encode() if isinstance(content, str) else content
+                )
                 file.flush()
                 os.fsync(file.fileno())
         for path, temporary in temporaries.items():

@@ -40,10 +40,16 @@ class LocalOrigin:
         The first call sets the origin to its first position.
         """
         if self.geodetic is None:
-            self.geodetic = float(lat_rad[0]), float(lon_rad[0]), float(height_m[0])
+            self.geodetic = (
+                float(lat_rad[0]),
+                float(lon_rad[0]),
+                float(height_m[0]),
+            )
         origin_lat, origin_lon, origin_height = np.array(self.geodetic)[:, None]
         positions = _earth_centred(lat_rad, lon_rad, height_m)
-        from_origin = positions - _earth_centred(origin_lat, origin_lon, origin_height)
+        from_origin = positions - _earth_centred(
+            origin_lat, origin_lon, origin_height
+        )
         # Product of vectors (N, 3) and axes (1, 3, 3). Sums have the same bits for one position (in
         # live use) and for many positions. A matrix product does not.
         terms = from_origin[:, :, None] * _axes(origin_lat, origin_lon)
@@ -88,7 +94,8 @@ def _earth_centred(
     from_axis = (normal + height_m) * cos_lat
     along_axis = ((1.0 - _ECCENTRICITY_2) * normal + height_m) * sin_lat
     return np.stack(
-        [from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis], axis=1
+        [from_axis * np.cos(lon_rad), from_axis * np.sin(lon_rad), along_axis],
+        axis=1,
     )
 
 

@@ -79,7 +79,9 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
                 f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
                 "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"
             ) from None
-        T = se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
+        T = se3.from_rotation_translation(
+            se3.rotation_from_rpy(values[3:]), values[:3]
+        )
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if (path / FILE_NAME).exists():
         path = path / FILE_NAME
@@ -105,10 +107,16 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
 def _only_pose(path: Path) -> FloatArray:
     """Return the pose (4, 4) of a TUM file with one pose, such as the truth of a simulation."""
     lines = read_bytes(path).decode("utf-8", "replace").splitlines()
-    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    rows = [
+        line.split()
+        for line in lines
+        if line.strip() and not line.startswith("#")
+    ]
     with located(path):
         if len(rows) != 1:
-            raise InputError(f"{len(rows)} poses; an installed transform is one pose")
+            raise InputError(
+                f"{len(rows)} poses; an installed transform is one pose"
+            )
         return pose_of(rows[0][1:])
 
 
@@ -198,8 +206,12 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
     for layouts in formats().values():
         fitting = [layout for layout in layouts if _fits(layout, nodes)]
         if fitting:
-            layout, is_inverted, _ = arranged(fitting, parent_frame, child_frame)
-            names, values = _of_sensors(nodes, layout.keys, {parent_frame, child_frame})
+            layout, is_inverted, _ = arranged(
+                fitting, parent_frame, child_frame
+            )
+            names, values = _of_sensors(
+                nodes, layout.keys, {parent_frame, child_frame}
+            )
             is_fixed = layout.is_inverted is not None
             if is_fixed and child_frame not in names and parent_frame in names:
                 # The file names the frame of its child, and here this sensor is the parent.
@@ -216,7 +228,9 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
 
 def _fits(layout: Layout, nodes: "Sequence[_Node]") -> bool:
     """Whether a mapping of the document has all keys of the layout."""
-    return bool(layout.keys) and any(_values_at(node, layout.keys) for _, node in nodes)
+    return bool(layout.keys) and any(
+        _values_at(node, layout.keys) for _, node in nodes
+    )
 
 
 # The keys that lead to a mapping in a document, and this mapping.
@@ -237,7 +251,9 @@ def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
             yield from _nodes(item, path)
 
 
-def _named_transform(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[Any, ...]:
+def _named_transform(
+    path: tuple[str, ...], node: Mapping[str, Any]
+) -> tuple[Any, ...]:
     """Return the parent frame, the child frame and the pose of a mapping that is a named transform.
 
     The pose is one value (any form of :func:`.frames.pose_of`), or two values: translation (m) and
@@ -247,7 +263,11 @@ def _named_transform(path: tuple[str, ...], node: Mapping[str, Any]) -> tuple[An
     parameters = node.get("parameters")
     # TransformStamped of ROS.
     if isinstance(header, Mapping) and "child_frame_id" in node:
-        return header.get("frame_id"), node["child_frame_id"], node.get("transform")
+        return (
+            header.get("frame_id"),
+            node["child_frame_id"],
+            node.get("transform"),
+        )
     # One transform of a list.
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
@@ -325,7 +345,9 @@ def read_urdf(path: str | Path) -> FrameTree:
 def _frames(data: bytes) -> FrameTree:
     """Return the frames of the text of a URDF file; raises as :func:`read_urdf`."""
     if b"<xacro:" in data:
-        raise InputError("has xacro macros; pass the URDF that xacro makes from it")
+        raise InputError(
+            "has xacro macros; pass the URDF that xacro makes from it"
+        )
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, LookupError, ValueError) as error:
@@ -345,7 +367,9 @@ def _frames(data: bytes) -> FrameTree:
             raise InputError(
                 f"joint {joint.get('name', '')!r} has no parent or no child"
             )
-        frames.add(links[0], links[1], T_parent_child, joint.get("type") == "fixed")
+        frames.add(
+            links[0], links[1], T_parent_child, joint.get("type") == "fixed"
+        )
     return frames
 
 
@@ -355,7 +379,11 @@ def _origin(joint: ElementTree.Element) -> list[float]:
     for origin in joint.findall("origin")[:1]:
         attributes |= origin.attrib
     values = numbers_of(" ".join(attributes.values()))
-    if len(attributes) != 2 or len(values) != 6 or not np.isfinite(values).all():
+    if (
+        len(attributes) != 2
+        or len(values) != 6
+        or not np.isfinite(values).all()
+    ):
         name = joint.get("name", "")
         raise InputError(
             f"the origin of joint {name!r} is not six numbers, xyz and rpy: {attributes}"

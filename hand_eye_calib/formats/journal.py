@@ -70,7 +70,10 @@ class JournalWriter:
     """
 
     def __init__(
-        self, directory: str | Path, about: About, resumed: "Journal | None" = None
+        self,
+        directory: str | Path,
+        about: About,
+        resumed: "Journal | None" = None,
     ) -> None:
         Path(directory).mkdir(parents=True, exist_ok=True)
         _refuse_foreign(Path(directory))
@@ -88,11 +91,16 @@ class JournalWriter:
         for stream in self._pending:
             # Without a buffer, data that was written survives a crash of this process.
             path = Path(directory, f"{stream}.tum")
-            self._files[stream] = open(path, "ab", buffering=0, opener=_open_no_link)  # noqa: SIM115
+            self._files[stream] = open(  # noqa: SIM115
+                path, "ab", buffering=0, opener=_open_no_link
+            )
             self._files[stream].truncate(whole_bytes.get(stream, 0))
         head = {"format": _FORMAT, "version": _VERSION}
         self.describe(
-            {stream: head | {"stream": stream} | {**about[stream]} for stream in about}
+            {
+                stream: head | {"stream": stream} | {**about[stream]}
+                for stream in about
+            }
         )
 
     def add_pose(
@@ -103,7 +111,9 @@ class JournalWriter:
         quat_xyzw: Sequence[float],
     ) -> None:
         """Add a pose. The next :meth:`flush` writes it."""
-        self._pending[stream].append(tum_line(stamp_ns, (*position, *quat_xyzw)))
+        self._pending[stream].append(
+            tum_line(stamp_ns, (*position, *quat_xyzw))
+        )
 
     def describe(self, about: About) -> None:
         """Write changes in the descriptions of streams immediately, after the pending poses."""
@@ -129,7 +139,9 @@ class JournalWriter:
                 self._write(stream, lines)
                 self._parent_poses += len(lines)
             else:
-                self._write(stream, [f'# {{"{_BATCH}": {self._parent_poses}}}', *lines])
+                self._write(
+                    stream, [f'# {{"{_BATCH}": {self._parent_poses}}}', *lines]
+                )
             lines.clear()
 
     def _write(self, stream: str, lines: Sequence[str]) -> None:
@@ -183,12 +195,16 @@ def read_journal(directory: str | Path) -> Journal:
     """
     paths = {stream: Path(directory, f"{stream}.tum") for stream in _STREAMS}
     files = {
-        stream: _read(path) for stream, path in paths.items() if os.path.lexists(path)
+        stream: _read(path)
+        for stream, path in paths.items()
+        if os.path.lexists(path)
     }
     # Check this after reading, because a node may have renamed the directory in the meantime.
     if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
-    rows = np.concatenate([np.reshape(file.values, (-1, 8)) for file in files.values()])
+    rows = np.concatenate(
+        [np.reshape(file.values, (-1, 8)) for file in files.values()]
+    )
     order = np.argsort(rows[:, 0], kind="stable")
     n_poses = [len(file.stamps_ns) for file in files.values()]
     stamps_ns = np.concatenate([file.stamps_ns for file in files.values()])
@@ -197,7 +213,9 @@ def read_journal(directory: str | Path) -> Journal:
         streams=np.repeat([*files], n_poses)[order],
         stamps_ns=stamps_ns[order],
         poses=rows[order, 1:],
-        whole_bytes={stream: file.whole_bytes for stream, file in files.items()},
+        whole_bytes={
+            stream: file.whole_bytes for stream, file in files.items()
+        },
     )
 
 
@@ -276,7 +294,9 @@ def _open_no_link(path: str, flags: int) -> int:
 
 def is_used(directory: str | Path) -> bool:
     """Whether a directory has a file with a stream's name, a journal or not."""
-    return any(os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS)
+    return any(
+        os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS
+    )
 
 
 def has_session(directory: str | Path) -> bool:
@@ -307,7 +327,9 @@ def keep_aside(directory: str | Path) -> Path:
             shutil.rmtree(aside)
         if not os.path.lexists(aside):
             return directory.replace(aside)
-    raise OSError(f"{aside} and earlier ones are no session journals; move them away")
+    raise OSError(
+        f"{aside} and earlier ones are no session journals; move them away"
+    )
 
 
 def _is_journal(directory: Path) -> bool:
@@ -315,7 +337,9 @@ def _is_journal(directory: Path) -> bool:
     if directory.is_symlink() or not directory.is_dir():
         return False
     names = {f"{stream}.tum" for stream in _STREAMS}
-    return all(path.name in names and _is_own(path) for path in directory.iterdir())
+    return all(
+        path.name in names and _is_own(path) for path in directory.iterdir()
+    )
 
 
 def count_poses(directory: str | Path) -> int | None:
@@ -326,7 +350,9 @@ def count_poses(directory: str | Path) -> int | None:
         return None
 
 
-def replay_journal(journal: Journal, directory: Path, engines: Calibrators) -> None:
+def replay_journal(
+    journal: Journal, directory: Path, engines: Calibrators
+) -> None:
     """Add the poses of a session to calibrators, in the order of their arrival.
 
     Raises

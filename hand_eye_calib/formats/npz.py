@@ -43,7 +43,10 @@ def read_arrays(
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            sizes = {member.filename: member.file_size for member in archive.infolist()}
+            sizes = {
+                member.filename: member.file_size
+                for member in archive.infolist()
+            }
             if sum(sizes.values()) > largest:
                 raise InputError(
                     f"cannot read {path}: its arrays take more than {largest} bytes"

@@ -50,12 +50,15 @@ def expanded(pattern: str) -> list[str]:
     """
     with _reached(pattern) as (system, path):
         return sorted(
-            system.unstrip_protocol(name) for name in system.glob(path.rstrip("/"))
+            system.unstrip_protocol(name)
+            for name in system.glob(path.rstrip("/"))
         )
 
 
 @contextmanager
-def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]]:
+def local_copies(
+    paths: Sequence[Any],
+) -> Iterator[tuple[list[Any], RestoreUrls]]:
     """Copy remote bags to this machine; the copies are removed at the end of the context.
 
     Errors that are raised in the context name the URLs instead of the copies.
@@ -80,7 +83,9 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]
         return
     with tempfile.TemporaryDirectory(prefix="hand_eye_calib_") as folder:
         local = [
-            _copied(str(path), Path(folder, str(number))) if is_url(path) else path
+            _copied(str(path), Path(folder, str(number)))
+            if is_url(path)
+            else path
             for number, path in enumerate(paths)
         ]
 
@@ -88,7 +93,9 @@ def local_copies(paths: Sequence[Any]) -> Iterator[tuple[list[Any], RestoreUrls]
             text = json.dumps(value)
             for copy, path in zip(local, paths, strict=True):
                 url = public(str(path)).rstrip("/")
-                text = text.replace(json.dumps(str(copy))[1:-1], json.dumps(url)[1:-1])
+                text = text.replace(
+                    json.dumps(str(copy))[1:-1], json.dumps(url)[1:-1]
+                )
             return json.loads(text)
 
         try:
@@ -104,10 +111,16 @@ def _copied(url: str, folder: Path) -> Path:
     with _reached(url) as (system, path):
         is_file = _name(path).endswith(_SUFFIXES)
         entries = (
-            _entries_of_file(system, path) if is_file else system.ls(path, detail=True)
+            _entries_of_file(system, path)
+            if is_file
+            else system.ls(path, detail=True)
         )
         suffixes = (*_SUFFIXES, *_JOURNALS)
-        files = [entry for entry in entries if _name(entry["name"]).endswith(suffixes)]
+        files = [
+            entry
+            for entry in entries
+            if _name(entry["name"]).endswith(suffixes)
+        ]
         if not files:
             raise InputError(
                 f"no bag there: expected files that end in {', '.join(_SUFFIXES)}"
@@ -159,7 +172,9 @@ def _reached(url: str) -> Iterator[tuple[Any, str]]:
     except HandEyeCalibError as error:
         raise InputError(f"cannot read {public(url)}: {error}") from None
     except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(".:")
+        reason = " ".join(f"{type(error).__name__}: {error}".split()).rstrip(
+            ".:"
+        )
         raise InputError(
             f"cannot read {public(url)}: {reason}; check the address and the read permission"
         ) from error

@@ -14,7 +14,12 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from hand_eye_calib.core.base.errors import InputError, located, printable, require_type
+from hand_eye_calib.core.base.errors import (
+    InputError,
+    located,
+    printable,
+    require_type,
+)
 from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.version import version_of
@@ -34,7 +39,11 @@ from hand_eye_calib.formats.files import (
     write_atomically,
     writing,
 )
-from hand_eye_calib.formats.yaml_files import UnreadableYamlError, read_yaml, yaml_text
+from hand_eye_calib.formats.yaml_files import (
+    UnreadableYamlError,
+    read_yaml,
+    yaml_text,
+)
 
 FILE_NAME = "extrinsic.yaml"
 RIG_NAME = "rig.yaml"
@@ -144,7 +153,9 @@ def save_rig(
     for calibration in calibrations:
         # Replace characters of the frame's name that the name of a folder should not contain.
         name = (
-            re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(".")
+            re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(
+                "."
+            )
             or "sensor"
         )
         while name in folders:
@@ -180,7 +191,9 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     written, no file changes.
     """
     contents = {
-        directory / name: text for name, text in texts.items() if text is not None
+        directory / name: text
+        for name, text in texts.items()
+        if text is not None
     }
     paths = [directory / name for name in texts]
     with writing(directory):
@@ -194,7 +207,9 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     return [*contents][-1]
 
 
-def _yaml_text(document: Mapping[str, Any], inputs: Mapping[str, Any] | None) -> str:
+def _yaml_text(
+    document: Mapping[str, Any], inputs: Mapping[str, Any] | None
+) -> str:
     """Return a document as YAML, with the versions, options and inputs that it was made from."""
     inputs = {**(inputs or {})}
     provenance = {
@@ -252,7 +267,11 @@ def keep_earlier_results(directory: str | Path) -> str:
         Path(directory, name)
         for name in (*_NAMES, *_names_of_parts(), RIG_NAME, REPORT_NAME)
     ]
-    copies = {previous / path.name: read_bytes(path) for path in paths if path.exists()}
+    copies = {
+        previous / path.name: read_bytes(path)
+        for path in paths
+        if path.exists()
+    }
     if not copies:
         return ""
     with writing(previous):
@@ -297,7 +316,9 @@ def load_result(path: str | Path) -> Calibration:
     path = path_of("path", path)
     if path.is_dir():
         if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
-            sensors = sorted(str(file.parent) for file in path.glob(f"*/{FILE_NAME}"))
+            sensors = sorted(
+                str(file.parent) for file in path.glob(f"*/{FILE_NAME}")
+            )
             raise InputError(
                 f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}"
             )
@@ -319,9 +340,13 @@ def load_result(path: str | Path) -> Calibration:
     try:
         document = read_yaml(path)
     except UnreadableYamlError as error:
-        raise InputError(f"{error}; restore the file, or calibrate again") from None
+        raise InputError(
+            f"{error}; restore the file, or calibrate again"
+        ) from None
     if document is None:
-        raise InputError(f"{path}: the file is empty; restore it, or calibrate again")
+        raise InputError(
+            f"{path}: the file is empty; restore it, or calibrate again"
+        )
     with located(path):
         return Calibration.from_dict(document)
 

@@ -91,7 +91,9 @@ class TfStream:
         self._last_ns: dict[str, int] = {}
         self._find_chain()
 
-    def add(self, transform: PoseFields, is_static: bool) -> Iterator[PoseFields]:
+    def add(
+        self, transform: PoseFields, is_static: bool
+    ) -> Iterator[PoseFields]:
         """Add a transform, and yield the sensor's poses for which all edges are now known.
 
         Raises the errors of :meth:`edges_at`.
@@ -129,7 +131,10 @@ class TfStream:
                 check_pose(*row)
         pose = _matrices(row) if is_static else None
         # The chain of edges changes if the edge is new, or if a static edge begins to move.
-        if was_static != self._tree.add(parent, frame, pose, is_static).is_static:
+        if (
+            was_static
+            != self._tree.add(parent, frame, pose, is_static).is_static
+        ):
             self._find_chain()
         if frame in self._moving and not is_static:
             yield from self._move(frame, transform.stamp_ns, row)
@@ -159,10 +164,13 @@ class TfStream:
         with suppress(InputError):
             up, down = self._tree.route(*self.source)
             frames = [
-                frame for frame in up + down if not self._tree.edges[frame].is_static
+                frame
+                for frame in up + down
+                if not self._tree.edges[frame].is_static
             ]
         self._moving = {
-            frame: self._moving.get(frame, deque(maxlen=_MOST_KEPT)) for frame in frames
+            frame: self._moving.get(frame, deque(maxlen=_MOST_KEPT))
+            for frame in frames
         }
 
     def _move(
@@ -192,7 +200,9 @@ class TfStream:
         """
         slowest = self._moving[self._slowest]
         others = {
-            name: edge for name, edge in self._moving.items() if edge is not slowest
+            name: edge
+            for name, edge in self._moving.items()
+            if edge is not slowest
         }
         while slowest and all(
             edge and edge[-1][0] >= slowest[0][0] for edge in others.values()
@@ -220,7 +230,9 @@ class TfStream:
         return max(intervals_ns, key=lambda name: intervals_ns[name])
 
 
-def _interpolated(edge: _MovingEdge, stamp_ns: int, max_gap_s: float) -> _Row | None:
+def _interpolated(
+    edge: _MovingEdge, stamp_ns: int, max_gap_s: float
+) -> _Row | None:
     """Return the interpolated pose of an edge at a stamp (ns).
 
     The result is None before the first pose, and between poses more than ``max_gap_s`` apart. The

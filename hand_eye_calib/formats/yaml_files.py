@@ -31,7 +31,9 @@ _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
 # The loader of libyaml is several times faster. Most builds of the package yaml contain it.
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _dump = partial(
-    yaml.dump, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper), sort_keys=False
+    yaml.dump,
+    Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper),
+    sort_keys=False,
 )
 
 
@@ -53,13 +55,17 @@ class _Loader(_Base):
         if tag is None or tag.rpartition(":")[2] in _TAGS
     }
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+    def construct_mapping(
+        self, node: Any, deep: bool = False
+    ) -> dict[Any, Any]:
         """Return a mapping; raise a ValueError for a repeated key."""
         names = set()
         for key, _ in node.value:
             if (name := str(key.value)) in names:
                 line = key.start_mark.line + 1
-                raise ValueError(f"the key {name[:40]!r} appears twice, line {line}")
+                raise ValueError(
+                    f"the key {name[:40]!r} appears twice, line {line}"
+                )
             names.add(name)
         return super().construct_mapping(node, deep)
 
@@ -101,7 +107,9 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     """
     text = read_text(path, expected, LARGEST_YAML)
     # Remove comments of JSON, and the header and tag of OpenCV.
-    text = re.sub(r"^%YAML.*|^[ \t]*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    text = re.sub(
+        r"^%YAML.*|^[ \t]*//.*|!!opencv-matrix", "", text, flags=re.MULTILINE
+    )
     try:
         _check_events(text)
         return yaml.load(text, Loader=_Loader)
@@ -110,13 +118,20 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
         # The parser names its source, which is always a text.
         words = re.sub(r' in "<[a-z ]+>",', ",", " ".join(str(error).split()))
         reason = shortened(words, LONGEST_NAME // 2) or type(error).__name__
-        raise UnreadableYamlError(f"{path} is not readable YAML: {reason}") from None
+        raise UnreadableYamlError(
+            f"{path} is not readable YAML: {reason}"
+        ) from None
 
 
 def yaml_text(document: Any) -> str:
     """Convert a document of any values to YAML that is easy to read."""
     return str(
-        _dump(plain(document), default_flow_style=None, width=120, allow_unicode=True)
+        _dump(
+            plain(document),
+            default_flow_style=None,
+            width=120,
+            allow_unicode=True,
+        )
     )
 
 
@@ -127,7 +142,9 @@ def _check_events(text: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > DEEPEST_YAML:
-            raise ValueError(f"it is nested more than {DEEPEST_YAML} levels deep")
+            raise ValueError(
+                f"it is nested more than {DEEPEST_YAML} levels deep"
+            )
         if isinstance(event, yaml.AliasEvent):
             raise ValueError(
                 f"aliases are not supported: write the value of {str(event.anchor)[:40]!r}"

@@ -16,8 +16,12 @@ def register() -> None:
     COMMANDS["calibrate"] = Command(
         "calibrate from two trajectory files, a bag or a journal", _calibrate
     )
-    COMMANDS["replay"] = Command("the same for bags and journals alone", _calibrate)
-    COMMANDS["check"] = Command("check two pose streams before any solve", _check)
+    COMMANDS["replay"] = Command(
+        "the same for bags and journals alone", _calibrate
+    )
+    COMMANDS["check"] = Command(
+        "check two pose streams before any solve", _check
+    )
     COMMANDS["info"] = Command("show a saved result", _info)
     COMMANDS["export"] = Command(
         "print a saved result as the file of another program", _export
@@ -63,7 +67,9 @@ def _report(result: Any, path: Path) -> Path:
     from hand_eye_calib.formats.results import save_text
     from hand_eye_calib.offline.report.report import render
 
-    return save_text(path, render(result, result.recording, interface=Interface.PYTHON))
+    return save_text(
+        path, render(result, result.recording, interface=Interface.PYTHON)
+    )
 
 
 def _html(result: Any) -> str:

@@ -44,5 +44,7 @@ def with_measurements(
         found, remarks = source.find(paths, snapshot)
         measurements += found
         notes += remarks
-    measured = replace(snapshot, beside_motion=tuple(measurements), bags=tuple(paths))
+    measured = replace(
+        snapshot, beside_motion=tuple(measurements), bags=tuple(paths)
+    )
     return measured, notes

@@ -35,7 +35,15 @@ from hand_eye_calib.formats.files import path_of
 from hand_eye_calib.offline.beside_motion import switched_off, with_measurements
 
 MethodName: TypeAlias = Literal[
-    "auto", "dnlo", "dnl", "park", "taylor", "zhuang", "ali", "adaptive", "robust"
+    "auto",
+    "dnlo",
+    "dnl",
+    "park",
+    "taylor",
+    "zhuang",
+    "ali",
+    "adaptive",
+    "robust",
 ]
 _Measures: TypeAlias = Literal[
     "auto",
@@ -144,7 +152,9 @@ def calibrate(
     >>> result.parent_frame, result.child_frame
     ('lidar', 'camera')
     """
-    values = {name: value for name, value in locals().items() if value is not None}
+    values = {
+        name: value for name, value in locals().items() if value is not None
+    }
     _check_settings(progress, checks, ground, is_bag=child is None)
     first, second = _read_both(
         parent, child, {"parent": parent_topic, "child": child_topic}
@@ -166,17 +176,25 @@ def calibrate(
     in_python = tuple(
         spelled(text, Interface.PYTHON) for text in result.calibration.warnings
     )
-    return replace(result.calibration, warnings=in_python, recording=result.snapshot)
+    return replace(
+        result.calibration, warnings=in_python, recording=result.snapshot
+    )
 
 
-def _check_settings(progress: Any, checks: Any, ground: Any, is_bag: bool) -> None:
+def _check_settings(
+    progress: Any, checks: Any, ground: Any, is_bag: bool
+) -> None:
     """Raise an error for arguments of :func:`calibrate` that are not allowed."""
     if progress is not None and not callable(progress):
-        raise InputError(f"progress must be a function; got {type(progress).__name__}")
+        raise InputError(
+            f"progress must be a function; got {type(progress).__name__}"
+        )
     if checks is not None:
         require_type("checks", checks, bool)
     if ground not in (None, "auto", "off"):
-        raise ConfigError(f"ground must be 'auto' or 'off'; got {shown_value(ground)}")
+        raise ConfigError(
+            f"ground must be 'auto' or 'off'; got {shown_value(ground)}"
+        )
     if ground is not None and not is_bag:
         raise ConfigError(
             "ground applies to a bag; for trajectories, call calibrate_on_ground"
@@ -190,7 +208,9 @@ def _read_both(
 ) -> Sequence[Trajectory]:
     """Return the trajectories of parent and child; without a child, ``parent`` is a bag."""
     if parent is None:
-        raise InputError("the parent must be a trajectory, a file or a bag; got None")
+        raise InputError(
+            "the parent must be a trajectory, a file or a bag; got None"
+        )
     if child is None and not isinstance(parent, str | PathLike):
         raise InputError(
             "a child is missing: pass two trajectories, or the path of a bag"
@@ -204,12 +224,16 @@ def _read_both(
             )
     if isinstance(parent, Trajectory) and isinstance(child, Trajectory):
         return parent, child
-    from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
+    from hand_eye_calib.formats.trajectory_files.reading import (
+        read_trajectories,
+    )
 
     return read_trajectories(parent, child)
 
 
-def _read_bag(path: Path, topics: Mapping[str, str | None]) -> Sequence[Trajectory]:
+def _read_bag(
+    path: Path, topics: Mapping[str, str | None]
+) -> Sequence[Trajectory]:
     """Return the trajectories of both streams of a bag; notes become Python warnings."""
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
@@ -261,14 +285,18 @@ def _options_in_words() -> list[str]:
         choices = field.metadata["choices"] or ()
         kind = " or ".join(map(repr, choices)) or type(field.default).__name__
         lines.append(f"{field.name} : {kind}, optional")
-        description = textwrap.wrap(f"{field.metadata['doc']} Default: {default}.", 92)
+        description = textwrap.wrap(
+            f"{field.metadata['doc']} Default: {default}.", 92
+        )
         lines += [f"    {line}" for line in description]
     return lines
 
 
 def _with_options(docstring: str) -> str:
     """Return a docstring with all options at the end of its parameters."""
-    parameters, heading, rest = re.split(r"(\n\n *Raises\n)", docstring, maxsplit=1)
+    parameters, heading, rest = re.split(
+        r"(\n\n *Raises\n)", docstring, maxsplit=1
+    )
     # Python 3.13 removes the indentation of docstrings.
     indentation = heading.strip("\n").removesuffix("Raises")
     options = "".join(f"\n{indentation}{line}" for line in _options_in_words())
@@ -295,7 +323,9 @@ def prior_fields(prior: Prior) -> dict[str, str]:
     options = {}
     for axis, value in prior.items():
         if axis not in AXIS_UNITS:
-            raise ConfigError(f"prior takes {', '.join(AXIS_UNITS)}; got {axis!r}")
+            raise ConfigError(
+                f"prior takes {', '.join(AXIS_UNITS)}; got {axis!r}"
+            )
         options[f"prior_{axis}"] = (
             value if isinstance(value, str) else _prior_text(axis, value)
         )

@@ -21,7 +21,15 @@ from reproduction.runner import in_parallel
 from reproduction.writing import seed_of, study_parser, write_csv
 
 METHODS = tuple(scores.METHODS)
-TABLES = ("simulated", "levels", "known answer", "rig", "parts", "cycle", "refused")
+TABLES = (
+    "simulated",
+    "levels",
+    "known answer",
+    "rig",
+    "parts",
+    "cycle",
+    "refused",
+)
 
 # Table, function and its arguments, the method among them, of a row.
 _Task = tuple[Any, ...]
@@ -29,11 +37,30 @@ _Task = tuple[Any, ...]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the study; returns the exit code."""
-    parser = study_parser("reproduction.coverage", __doc__, page="write the page there")
+    parser = study_parser(
+        "reproduction.coverage", __doc__, page="write the page there"
+    )
     add = parser.add_argument
-    add("--methods", nargs="+", choices=METHODS, default=METHODS, help="default: both")
-    add("--tables", nargs="+", choices=TABLES, default=TABLES, help="default: all")
-    add("--seeds", type=int, default=10, help="recordings per class. Default: 10")
+    add(
+        "--methods",
+        nargs="+",
+        choices=METHODS,
+        default=METHODS,
+        help="default: both",
+    )
+    add(
+        "--tables",
+        nargs="+",
+        choices=TABLES,
+        default=TABLES,
+        help="default: all",
+    )
+    add(
+        "--seeds",
+        type=int,
+        default=10,
+        help="recordings per class. Default: 10",
+    )
     add(
         "--seed",
         type=int,
@@ -47,7 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         first = seed_of(arguments.seed)
         folder = arguments.data_folder
         seeds = range(first, first + arguments.seeds)
-        rigs, absent = real_rigs(folder) if folder else ([], ["every real recording"])
+        rigs, absent = (
+            real_rigs(folder) if folder else ([], ["every real recording"])
+        )
         tasks = [
             task
             for method in arguments.methods
@@ -61,17 +90,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.page.write_text(text, encoding="utf-8")
         if arguments.rows:
             names = ("table", "name", "method")
-            named = [{name: getattr(row, name) for name in names} for row in rows]
+            named = [
+                {name: getattr(row, name) for name in names} for row in rows
+            ]
             values = [{kind: row.value(kind) for kind in KINDS} for row in rows]
             write_csv(
-                arguments.rows, [{**a, **b} for a, b in zip(named, values, strict=True)]
+                arguments.rows,
+                [{**a, **b} for a, b in zip(named, values, strict=True)],
             )
         return 0
 
     return exit_code_of(run)
 
 
-def measure(tasks: Sequence[_Task], methods: Sequence[str], jobs: int) -> list[Row]:
+def measure(
+    tasks: Sequence[_Task], methods: Sequence[str], jobs: int
+) -> list[Row]:
     """Rows of every class, level, rig and cycle, then the pooled ones."""
     rows: list[Row] = [*in_parallel(call, [task[1:] for task in tasks], jobs)]
     rows += [
@@ -115,16 +149,21 @@ def _tasks_of_rig(method: str, rig: Rig) -> list[_Task]:
     """Measures of the recordings of a real rig."""
     names = list(rig.recordings)
     if rig.is_refused:
-        return [("refused", scores.refused_row, rig, name, method) for name in names]
+        return [
+            ("refused", scores.refused_row, rig, name, method) for name in names
+        ]
     tasks: list[_Task] = []
     if rig.truth is not None:
         tasks += [
-            ("known answer", scores.truth_row, rig, name, method) for name in names
+            ("known answer", scores.truth_row, rig, name, method)
+            for name in names
         ]
     if len(names) > 1:
         tasks.append(("rig", scores.scatter_row, rig, method))
     if rig.is_cut:
-        tasks += [("parts", scores.parts_row, rig, name, method) for name in names]
+        tasks += [
+            ("parts", scores.parts_row, rig, name, method) for name in names
+        ]
     return tasks
 
 

@@ -62,7 +62,9 @@ class _StateSpace:
     first: FloatArray
 
 
-def cramer_rao_bound(sides: Sequence[Side], child: FloatArray, dt: float) -> FloatArray:
+def cramer_rao_bound(
+    sides: Sequence[Side], child: FloatArray, dt: float
+) -> FloatArray:
     """Least covariance (6, 6) of xi in ``X Exp(xi)``, (rho, phi), child frame, of any unbiased
     estimator.
 
@@ -100,7 +102,10 @@ def ideal_estimate(
 
 
 def normal_equations(
-    sides: Sequence[Side], child: FloatArray, dt: float, z: FloatArray | None = None
+    sides: Sequence[Side],
+    child: FloatArray,
+    dt: float,
+    z: FloatArray | None = None,
 ) -> FloatArray:
     """Information on xi, behind it on the pose of the worlds if odometry does not drift, and the
     right-hand side as last column if z is given.
@@ -149,7 +154,9 @@ def _latents(side: Side, dt: float) -> list[_Latent]:
         in_step = scale_columns(steps) @ to_error.T
         not_in_pose = np.zeros((n_poses, 6, 1))
         phi = _phi(dt, tau_s)
-        latents.append(_Latent(phi, variances, not_in_pose, in_step[:, :, None]))
+        latents.append(
+            _Latent(phi, variances, not_in_pose, in_step[:, :, None])
+        )
     return latents
 
 
@@ -219,7 +226,9 @@ def _eliminated(
 ) -> FloatArray:
     """Gram matrix (p, p) of columns (N, 6, p) after eliminating the states."""
     n_columns = columns.shape[2]
-    gram = np.einsum("nji,njk,nkl->il", columns, weights, columns, optimize=True)
+    gram = np.einsum(
+        "nji,njk,nkl->il", columns, weights, columns, optimize=True
+    )
     n_states = space.H.shape[2]
     if n_states == 0:
         return gram

@@ -201,7 +201,9 @@ CLASSES = {
         rate_hz=10.0,
         parent=_INS,
         child=replace(
-            _white(0.004, 0.02), walk_by_metre=sigmas(0.004, 0.01), scale=(0.01, 40.0)
+            _white(0.004, 0.02),
+            walk_by_metre=sigmas(0.004, 0.01),
+            scale=(0.01, 40.0),
         ),
         lever_m=1.2,
     ),
@@ -257,7 +259,8 @@ CLASSES = {
         child=_slow(
             SensorErrors(
                 white=sigmas(
-                    np.array([0.0008, 0.0008, 0.003]), np.array([0.3, 0.3, 0.06])
+                    np.array([0.0008, 0.0008, 0.003]),
+                    np.array([0.3, 0.3, 0.06]),
                 )
             ),
             1.0,
@@ -287,11 +290,17 @@ CLASSES = {
         duration_s=120.0,
         rate_hz=20.0,
         parent=SensorErrors(
-            white=sigmas(np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1]))
+            white=sigmas(
+                np.array([0.002, 0.002, 0.012]), np.array([0.3, 0.1, 0.1])
+            )
         ),
         child=SensorErrors(
-            white=sigmas(np.array([0.015, 0.003, 0.003]), np.array([0.1, 0.1, 0.5])),
-            walk=sigmas(np.array([0.004, 0.001, 0.001]), np.array([0.01, 0.01, 0.04])),
+            white=sigmas(
+                np.array([0.015, 0.003, 0.003]), np.array([0.1, 0.1, 0.5])
+            ),
+            walk=sigmas(
+                np.array([0.004, 0.001, 0.001]), np.array([0.01, 0.01, 0.04])
+            ),
         ),
     ),
     "hand_mixture_30s": _hand(
@@ -299,7 +308,9 @@ CLASSES = {
         rate_hz=30.0,
         parent=_white(0.001, 0.08),
         child=_slow(
-            replace(_white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2),
+            replace(
+                _white(0.002, 0.1), walk=sigmas(0.003, 0.05), jumps_per_s=0.2
+            ),
             2.0,
             0.002,
             0.1,

@@ -32,7 +32,9 @@ def _root_of_median(median: float) -> _Statistic:
 
     def statistic(groups: list[FloatArray]) -> float:
         return float(
-            np.exp(np.mean([0.5 * np.log(np.median(g) / median) for g in groups]))
+            np.exp(
+                np.mean([0.5 * np.log(np.median(g) / median) for g in groups])
+            )
         )
 
     return statistic
@@ -55,7 +57,10 @@ KINDS: dict[str, tuple[str, _Statistic]] = {
     "covers": ("90 % covers", _mean),
     "covers_floor": ("with the floor", _mean),
     "covers_truth": ("with the truth's own sigma", _mean),
-    "scatter": ("scatter / sigma", lambda groups: float(np.sqrt(_mean(groups)))),
+    "scatter": (
+        "scatter / sigma",
+        lambda groups: float(np.sqrt(_mean(groups))),
+    ),
     "mm": ("error (mm)", _median),
     "deg": ("error (deg)", _median),
     "z": ("largest error / sigma", _median),

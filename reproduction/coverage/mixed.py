@@ -9,7 +9,12 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from reproduction.coverage import motions
 from reproduction.coverage.classes import RecordingClass, Simulated, simulate
-from reproduction.coverage.sensor_errors import GaussMarkov, SensorErrors, Tail, sigmas
+from reproduction.coverage.sensor_errors import (
+    GaussMarkov,
+    SensorErrors,
+    Tail,
+    sigmas,
+)
 
 # Motion, lever arm (m) and size of its errors; whether odometry drifts by the metre.
 _KINDS = {
@@ -66,9 +71,13 @@ def _drawn_errors(
     if rng.random() < 0.55:
         errors = _drifting(errors, rng, size, by_metre)
     if rng.random() < 0.5:
-        errors = _slow(errors, rng, (0.15, 10.0), (0.001 * size, 0.01 * size), False)
+        errors = _slow(
+            errors, rng, (0.15, 10.0), (0.001 * size, 0.01 * size), False
+        )
     if rng.random() < 0.4:
-        errors = _slow(errors, rng, (2.0, 40.0), (0.005 * size, 0.05 * size), True)
+        errors = _slow(
+            errors, rng, (2.0, 40.0), (0.005 * size, 0.05 * size), True
+        )
     if rng.random() < 0.2:
         sigma = _between(rng, 0.002, 0.015)
         tau_s = _between(rng, 5.0, 60.0)
@@ -79,7 +88,9 @@ def _drawn_errors(
         tail = _TAILS[rng.integers(len(_TAILS))]
         errors = replace(errors, tail=tail)
     if rng.random() < 0.12:
-        errors = replace(errors, jumps_per_s=0.05, jump=sigmas(0.05 * size, 0.5))
+        errors = replace(
+            errors, jumps_per_s=0.05, jump=sigmas(0.05 * size, 0.5)
+        )
     return errors
 
 
@@ -103,7 +114,9 @@ def _slow(
 ) -> SensorErrors:
     sigma_m = _between(rng, *metres)
     sigma_deg = _between(rng, 0.03, 0.3)
-    process = GaussMarkov(_between(rng, *tau_s), sigmas(sigma_m, sigma_deg), in_world)
+    process = GaussMarkov(
+        _between(rng, *tau_s), sigmas(sigma_m, sigma_deg), in_world
+    )
     return replace(errors, slow=(*errors.slow, process))
 
 

@@ -122,7 +122,8 @@ def _ground_vehicle(
     heading = np.cumsum(yaw_rate) / _RATE
     level = np.cos(slope)
     ahead = np.stack(
-        [np.cos(heading) * level, np.sin(heading) * level, np.sin(slope)], axis=-1
+        [np.cos(heading) * level, np.sin(heading) * level, np.sin(slope)],
+        axis=-1,
     )
     velocity = speed[:, None] * ahead
     positions = np.cumsum(velocity, axis=0) / _RATE
@@ -157,10 +158,14 @@ def car(rng: np.random.Generator, duration_s: float) -> Motion:
     bank = np.radians(1.2) * _wave(rng, times, (0.03, 0.15))
     bump_sizes = np.array([0.006, 0.005, 0.015])
     bumps = bump_sizes * _waves(rng, times, 3, (0.5, 1.5))
-    return _ground_vehicle(times, speed, bend_rate + turn_rate, slope, bank, bumps)
+    return _ground_vehicle(
+        times, speed, bend_rate + turn_rate, slope, bank, bumps
+    )
 
 
-def agv(rng: np.random.Generator, duration_s: float, ramps: bool = True) -> Motion:
+def agv(
+    rng: np.random.Generator, duration_s: float, ramps: bool = True
+) -> Motion:
     """An automated guided vehicle in a hall: turns, and ramps up and down of 3 or 6 degrees.
 
     Without ``ramps`` the floor is flat and has no bumps.

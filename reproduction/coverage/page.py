@@ -14,7 +14,14 @@ from reproduction.writing import markdown_table
 _COLUMNS = {
     "simulated": ("bound", "bound_t", "bound_r", "nees", "covers"),
     "levels": ("mm", "deg", "covers"),
-    "known answer": ("mm", "deg", "z", "covers", "covers_floor", "covers_truth"),
+    "known answer": (
+        "mm",
+        "deg",
+        "z",
+        "covers",
+        "covers_floor",
+        "covers_truth",
+    ),
 }
 _TITLES = {
     "simulated": "Simulated recordings",
@@ -55,15 +62,27 @@ class Goal(NamedTuple):
 _EACH = "(?!all )"
 GOALS = (
     Goal(
-        "error over bound, geometric mean at most 1.05", "simulated", "bound", 0, 1.05
+        "error over bound, geometric mean at most 1.05",
+        "simulated",
+        "bound",
+        0,
+        1.05,
     ),
     Goal("no class above 1.4", "simulated", "bound", 0, 1.4, _EACH),
     Goal("median NEES 4.5 to 6.0", "simulated", "nees", 4.5, 6.0),
-    Goal("90 % intervals cover 0.88 to 0.92", "simulated", "covers", 0.88, 0.92),
-    Goal("0.82 to 0.97 in every class", "simulated", "covers", 0.82, 0.97, _EACH),
+    Goal(
+        "90 % intervals cover 0.88 to 0.92", "simulated", "covers", 0.88, 0.92
+    ),
+    Goal(
+        "0.82 to 0.97 in every class", "simulated", "covers", 0.82, 0.97, _EACH
+    ),
     Goal("flat_agv is refused", "simulated", "refused", 1.0, 1.0, "flat_agv"),
     Goal(
-        "real, with the floor: 0.87 to 0.93", "known answer", "covers_floor", 0.87, 0.93
+        "real, with the floor: 0.87 to 0.93",
+        "known answer",
+        "covers_floor",
+        0.87,
+        0.93,
     ),
     Goal("without it at least 0.80", "known answer", "covers", 0.8, 1.0),
     Goal("scatter of rigs over sigma 0.8 to 1.25", "rig", "scatter", 0.8, 1.25),
@@ -77,7 +96,9 @@ GOALS = (
     ),
     Goal("three devices close to 0.10 deg", "cycle", "deg", 0, 0.1, "tango"),
     Goal("chi2 of that is below 12.6", "cycle", "chi2", 0, 12.6, "tango"),
-    Goal("what leaves something open is refused", "refused", "refused", 1.0, 1.0),
+    Goal(
+        "what leaves something open is refused", "refused", "refused", 1.0, 1.0
+    ),
 )
 
 
@@ -109,7 +130,11 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
         ]
         if chosen:
             shown = (_shown(row, columns, methods[0]) for row in chosen)
-            blocks += [f"## {_TITLES[table]}", _ABOUT[table], markdown_table(shown)]
+            blocks += [
+                f"## {_TITLES[table]}",
+                _ABOUT[table],
+                markdown_table(shown),
+            ]
     about = f"{len(seeds)} of each class, from seed {seeds.start} on. All rows: `--rows FILE`."
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
@@ -127,11 +152,14 @@ def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
         if (row.table, row.method) == (goal.table, method)
         and re.match(goal.names, row.name)
     }
-    values = {name: value for name, value in values.items() if np.isfinite(value)}
+    values = {
+        name: value for name, value in values.items() if np.isfinite(value)
+    }
     if not values:
         return ""
     name = max(
-        values, key=lambda name: max(goal.low - values[name], values[name] - goal.high)
+        values,
+        key=lambda name: max(goal.low - values[name], values[name] - goal.high),
     )
     text = f"{values[name]:.3g}" + (f" ({name})" if len(values) > 1 else "")
     return text if goal.low <= values[name] <= goal.high else f"**{text}**"

@@ -12,7 +12,11 @@ from hand_eye_calib.core.base.errors import HandEyeCalibError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import absolute_errors, deviation
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.coverage import classes
@@ -43,7 +47,9 @@ def answer(
 
 def _of_rig(rig: Rig, name: str, method: str) -> Calibration | None:
     recording = rig.recordings[name]
-    return answer(recording.parent, recording.child, {**rig.options, **METHODS[method]})
+    return answer(
+        recording.parent, recording.child, {**rig.options, **METHODS[method]}
+    )
 
 
 def _name_of(rig: Rig, name: str) -> str:
@@ -100,7 +106,9 @@ def _covers(xi: FloatArray, result: Calibration) -> dict[str, float]:
     return {"covers": float(is_within.mean())}
 
 
-def level_row(folder: Path, dataset: str, level: float | None, method: str) -> Row:
+def level_row(
+    folder: Path, dataset: str, level: float | None, method: str
+) -> Row:
     """Errors on the published trajectories of a level."""
     levels = None if level is None else [level]
     cases = {}
@@ -131,7 +139,9 @@ def truth_row(rig: Rig, name: str, method: str) -> Row:
     return Row("known answer", _name_of(rig, name), method, cases)
 
 
-def truth_cases(result: Calibration, truth: Truth) -> dict[str, dict[str, float]]:
+def truth_cases(
+    result: Calibration, truth: Truth
+) -> dict[str, dict[str, float]]:
     """Error of an answer over the axes that both know, and whether its intervals cover the truth:
     without the common-mode floor, with it, and with the uncertainty of the truth.
     """
@@ -139,7 +149,9 @@ def truth_cases(result: Calibration, truth: Truth) -> dict[str, dict[str, float]
     error = deviation(result.T_parent_child, truth.T_parent_child)
     # A rotation whose axis is not known to the truth has no small rotation vector.
     if not np.isfinite(truth.sigmas[3:]).all():
-        error[3:] = _angle_differences(result.T_parent_child, truth.T_parent_child)
+        error[3:] = _angle_differences(
+            result.T_parent_child, truth.T_parent_child
+        )
 
     sigmas = np.where(is_comparable, result.sigmas_measured, 1.0)
     sigmas_with_floor = np.where(is_comparable, result.sigmas, 1.0)
@@ -225,7 +237,9 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
     sigmas = np.array([result.sigmas_measured for result in good])
     variances = np.where(is_comparable, sigmas, 1.0) ** 2
     first = good[0].T_parent_child
-    deviations = np.array([deviation(result.T_parent_child, first) for result in good])
+    deviations = np.array(
+        [deviation(result.T_parent_child, first) for result in good]
+    )
     ratios = deviations.var(axis=0, ddof=1) / variances.mean(axis=0)
 
     cases = {}

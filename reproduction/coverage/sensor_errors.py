@@ -13,7 +13,9 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
 
 
-def sigmas(metres: float | FloatArray, degrees: float | FloatArray) -> FloatArray:
+def sigmas(
+    metres: float | FloatArray, degrees: float | FloatArray
+) -> FloatArray:
     """Standard deviations (6,) of (rho, phi), in m and rad."""
     translation = np.full(3, 1.0) * metres
     rotation = np.radians(np.full(3, 1.0) * degrees)
@@ -43,7 +45,9 @@ class Tail:
     share: float = 0.0
     factor: float = 1.0
 
-    def draw(self, rng: np.random.Generator, count: int, dt: float) -> FloatArray:
+    def draw(
+        self, rng: np.random.Generator, count: int, dt: float
+    ) -> FloatArray:
         """Factors (N,)."""
         if self.kind == "student":
             chi_squared = rng.chisquare(self.factor, count)
@@ -81,7 +85,9 @@ def _bursts(
     return flags
 
 
-def mixture_information(share: float, factor: float, dimensions: int = 6) -> float:
+def mixture_information(
+    share: float, factor: float, dimensions: int = 6
+) -> float:
     """Fisher information of the location of (1 - share) N(0, I) + share N(0, factor^2 I), per
     dimension, by an integral over the radius.
     """

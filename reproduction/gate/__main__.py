@@ -23,7 +23,12 @@ from hand_eye_calib.offline.cli.options import note
 from reproduction.coverage.classes import CLASSES
 from reproduction.coverage.mixed import MIXED
 from reproduction.gate import against
-from reproduction.gate.baseline import Baseline, Comparison, compare, compare_new_draw
+from reproduction.gate.baseline import (
+    Baseline,
+    Comparison,
+    compare,
+    compare_new_draw,
+)
 from reproduction.gate.cases import real_cases, simulated_cases
 from reproduction.gate.scores import Score, score, score_simulated
 from reproduction.runner import in_parallel
@@ -48,7 +53,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         action="store_true",
         help="fewer recordings, simulated ones only: one minute",
     )
-    add("--update", action="store_true", help="store the scores as the new baseline")
+    add(
+        "--update",
+        action="store_true",
+        help="store the scores as the new baseline",
+    )
     add(
         "--baseline",
         metavar="FILE",
@@ -62,7 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=os.cpu_count() or 1,
         help="processes. Default: all cores",
     )
-    add("--against", metavar="FOLDER", type=Path, help="folder with another version")
+    add(
+        "--against",
+        metavar="FOLDER",
+        type=Path,
+        help="folder with another version",
+    )
     add(
         "--pieces",
         type=int,
@@ -75,7 +89,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=4,
         help="with --against: recordings of each platform",
     )
-    add("--seed", type=int, help="with --update or --against: draw other recordings")
+    add(
+        "--seed",
+        type=int,
+        help="with --update or --against: draw other recordings",
+    )
     return exit_code_of(lambda: _run(parser.parse_args(argv)))
 
 
@@ -97,7 +115,9 @@ def _check(arguments: Namespace) -> int:
     numbers = QUICK if arguments.quick else USUAL
     folder = None if arguments.quick else arguments.data_folder
     scores = measure(baseline.seed, numbers, folder, arguments.jobs)
-    unknown = [score.name for score in scores if score.name not in baseline.scores]
+    unknown = [
+        score.name for score in scores if score.name not in baseline.scores
+    ]
     if unknown:
         raise ConfigError(
             f"the baseline has no score of {unknown[0]} and {len(unknown) - 1} other recordings. "
@@ -127,7 +147,9 @@ def _report(comparisons: Sequence[Comparison], baseline: Baseline) -> str:
     if failures:
         lines += [f"Worse than the baseline ({versions()}):"]
         lines += [f"- {failure}" for failure in failures]
-        lines += ["If that is meant, store new scores: make gate GATE_ARGS=--update"]
+        lines += [
+            "If that is meant, store new scores: make gate GATE_ARGS=--update"
+        ]
     else:
         lines += ["Not worse than the baseline."]
     return "\n".join(lines)
@@ -147,7 +169,9 @@ def _update(arguments: Namespace) -> int:
     measured = {score.name: score for score in scores}
     kept = len(stored.keys() - measured.keys())
     if kept:
-        note(f"{kept} scores of recordings that are not in reach stay as they were")
+        note(
+            f"{kept} scores of recordings that are not in reach stay as they were"
+        )
     Baseline(seed, versions(), stored | measured).write(arguments.baseline)
     print(f"{len(measured)} scores in {arguments.baseline}")
     return 0
@@ -158,7 +182,9 @@ def measure(
 ) -> list[Score]:
     """Score simulated recordings, then real ones if there is a folder of them."""
     draws = [
-        (family, seed, k) for family, count in numbers.items() for k in range(count)
+        (family, seed, k)
+        for family, count in numbers.items()
+        for k in range(count)
     ]
     scores = [*in_parallel(score_simulated, draws, jobs)]
     if folder is not None:
@@ -173,10 +199,16 @@ def _against(arguments: Namespace) -> int:
     cases = [*simulated_cases(seed, arguments.repeats)]
     if arguments.data_folder:
         rng = np.random.default_rng(seed)
-        cases = [*real_cases(arguments.data_folder, arguments.pieces, rng), *cases]
+        cases = [
+            *real_cases(arguments.data_folder, arguments.pieces, rng),
+            *cases,
+        ]
     package = Path(__file__).resolve().parents[2]
     table = against.table(cases, package, arguments.against)
-    show(arguments.page, {"gate": f"Seed {seed}, {len(cases)} recordings.\n\n{table}"})
+    show(
+        arguments.page,
+        {"gate": f"Seed {seed}, {len(cases)} recordings.\n\n{table}"},
+    )
     return 0
 
 

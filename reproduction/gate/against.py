@@ -43,7 +43,9 @@ pickle.dump(found, open(sys.argv[2], "wb"))
 _90_PERCENT = 1.645
 
 
-def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[Any]:
+def solved(
+    cases: list[Case], package: Path, options: dict[str, Any]
+) -> list[Any]:
     """Answers of the version of the package in a folder."""
     asked = []
     for case in cases:
@@ -54,7 +56,13 @@ def solved(cases: list[Case], package: Path, options: dict[str, Any]) -> list[An
         answers_file = Path(folder) / "found"
         cases_file.write_bytes(pickle.dumps(asked))
         environment = os.environ | {"PYTHONPATH": str(package)}
-        command = [sys.executable, "-c", _SOLVE, str(cases_file), str(answers_file)]
+        command = [
+            sys.executable,
+            "-c",
+            _SOLVE,
+            str(cases_file),
+            str(answers_file),
+        ]
         subprocess.run(command, check=True, env=environment, cwd=folder)
         return list(pickle.loads(answers_file.read_bytes()))
 
@@ -109,8 +117,13 @@ def row(
         to_parent = np.kron(np.eye(2), T[:3, :3])
         errors = deviation(T, case.T_parent_child)
         is_comparable = is_known & np.isfinite(case.sigmas)
-        for flags, covariance in ((is_inside, measured), (is_inside_with_floor, whole)):
-            variances = np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
+        for flags, covariance in (
+            (is_inside, measured),
+            (is_inside_with_floor, whole),
+        ):
+            variances = (
+                np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
+            )
             is_covered = np.abs(errors) < _90_PERCENT * np.sqrt(variances)
             flags += [*is_covered[is_comparable]]
         if case.bound is not None and is_known.all():
@@ -140,7 +153,9 @@ def table(cases: list[Case], package: Path, against: Path) -> str:
     rows = []
     families = [*dict.fromkeys(case.family for case in cases)]
     for family in (*families, "all"):
-        which = [i for i, case in enumerate(cases) if family in ("all", case.family)]
+        which = [
+            i for i, case in enumerate(cases) if family in ("all", case.family)
+        ]
 
         others_of_family = {
             name: _chosen(answers, which) for name, answers in others.items()

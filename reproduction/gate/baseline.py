@@ -48,7 +48,9 @@ class Tolerances:
 
 
 _OF_ALL = Tolerances(error_ratio=1.03, coverage=0.02, nees=1.15, stricter=0.05)
-_OF_FAMILY = Tolerances(error_ratio=1.15, coverage=0.10, nees=1.6, stricter=0.34)
+_OF_FAMILY = Tolerances(
+    error_ratio=1.15, coverage=0.10, nees=1.6, stricter=0.34
+)
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,9 @@ class Baseline:
 
     def write(self, path: Path) -> None:
         """Write a file with a line for each recording."""
-        lines = [json.dumps(_values_of(score)) for score in self.scores.values()]
+        lines = [
+            json.dumps(_values_of(score)) for score in self.scores.values()
+        ]
         scores = ",\n".join(lines)
         head = f'"seed": {self.seed},\n"versions": {json.dumps(self.versions)}'
         path.write_text(
@@ -86,7 +90,9 @@ def _values_of(score: Score) -> dict[str, Any]:
     """Values that differ from those of a recording without an answer, rounded."""
     empty = asdict(Score(family="", name="", verdict=""))
     values = {
-        name: value for name, value in asdict(score).items() if value != empty[name]
+        name: value
+        for name, value in asdict(score).items()
+        if value != empty[name]
     }
     for name in ("over_bound", "nees"):
         if name in values:
@@ -101,7 +107,12 @@ def _score_of(values: dict[str, Any]) -> Score:
     errors = tuple(values.get("errors", ()))
     robust_errors = tuple(values.get("robust_errors", ()))
     return Score(
-        **{"verdict": "", **values, "errors": errors, "robust_errors": robust_errors}
+        **{
+            "verdict": "",
+            **values,
+            "errors": errors,
+            "robust_errors": robust_errors,
+        }
     )
 
 
@@ -172,7 +183,9 @@ _FORMATS = {
 
 def _figures(scores: Sequence[Score]) -> dict[str, float]:
     """Figures of one version; NaN without a recording that has the figure."""
-    over_bound = [score.over_bound for score in scores if score.over_bound is not None]
+    over_bound = [
+        score.over_bound for score in scores if score.over_bound is not None
+    ]
     nees = [score.nees for score in scores if score.nees is not None]
     over_robust = over_robust_least_squares(scores)
     axes = sum(score.axes for score in scores) or np.nan
@@ -181,7 +194,8 @@ def _figures(scores: Sequence[Score]) -> dict[str, float]:
         "over robust": _quantile(over_robust, 0.5),
         "over robust, 90 %": _quantile(over_robust, 0.9),
         "90 % covers": sum(score.inside for score in scores) / axes,
-        "with allowance": sum(score.inside_allowance for score in scores) / axes,
+        "with allowance": sum(score.inside_allowance for score in scores)
+        / axes,
         "NEES": _quantile(nees, 0.5),
         "no answer": float(sum(not score.verdict for score in scores)),
         "USE but wrong": float(sum(score.is_wrong for score in scores)),
@@ -201,7 +215,9 @@ def over_robust_least_squares(scores: Sequence[Score]) -> list[float]:
     """
     ratios = []
     for score in scores:
-        for error, robust_error in zip(score.errors, score.robust_errors, strict=False):
+        for error, robust_error in zip(
+            score.errors, score.robust_errors, strict=False
+        ):
             if error > 0.0 and robust_error > 0.0:
                 ratios.append(error / robust_error)
     return ratios
@@ -249,12 +265,17 @@ def _failures(
             f"90 % intervals cover {figures['90 % covers']:.1%}, before "
             f"{old_figures['90 % covers']:.1%}"
         )
-    if figures["with allowance"] < old_figures["with allowance"] - tolerances.coverage:
+    if (
+        figures["with allowance"]
+        < old_figures["with allowance"] - tolerances.coverage
+    ):
         yield (
             f"90 % intervals with the allowance cover {figures['with allowance']:.1%}, before "
             f"{old_figures['with allowance']:.1%}"
         )
-    if abs(np.log(figures["NEES"] / old_figures["NEES"])) > np.log(tolerances.nees):
+    if abs(np.log(figures["NEES"] / old_figures["NEES"])) > np.log(
+        tolerances.nees
+    ):
         yield f"the median NEES is {figures['NEES']:.2f}, before {old_figures['NEES']:.2f}"
     for name in ("no answer", "USE but wrong"):
         if figures[name] > old_figures[name]:
@@ -280,7 +301,9 @@ def compare_new_draw(
         )
     shares = [_shares_outside(scores), _shares_outside(old_scores)]
     if _excess(shares) > _CHANCE:
-        failures.append("new draw: 90 % intervals cover less than in the baseline")
+        failures.append(
+            "new draw: 90 % intervals cover less than in the baseline"
+        )
     row: dict[str, object] = {
         "family": "platforms drawn anew",
         "recordings": len(scores),
@@ -288,16 +311,22 @@ def compare_new_draw(
     for name, form in _FORMATS.items():
         is_known = name in figures
         text = f"{form} ({form})"
-        row[name] = text.format(figures[name], old_figures[name]) if is_known else ""
+        row[name] = (
+            text.format(figures[name], old_figures[name]) if is_known else ""
+        )
     return Comparison(row | {"result": _result(failures)}, failures)
 
 
 def _log_errors(scores: Sequence[Score]) -> FloatArray:
-    return np.array([np.log(score.over_bound) for score in scores if score.over_bound])
+    return np.array(
+        [np.log(score.over_bound) for score in scores if score.over_bound]
+    )
 
 
 def _shares_outside(scores: Sequence[Score]) -> FloatArray:
-    return np.array([1.0 - score.inside / score.axes for score in scores if score.axes])
+    return np.array(
+        [1.0 - score.inside / score.axes for score in scores if score.axes]
+    )
 
 
 def _excess(samples: Sequence[FloatArray]) -> float:

@@ -67,7 +67,9 @@ def real_cases(
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
             continue
         options = {
-            name: value for name, value in rig.options.items() if name in option_names
+            name: value
+            for name, value in rig.options.items()
+            if name in option_names
         }
         family = rig.name if "kitti" in rig.name else rig.name.split("_")[0]
         for name, recording in rig.recordings.items():

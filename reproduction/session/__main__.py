@@ -24,10 +24,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     out = Path("reproduced")
     about = "where results are kept; they are not solved again"
     add(
-        "--rows", metavar="DIR", type=Path, default=out, help=f"{about}. Default: {out}"
+        "--rows",
+        metavar="DIR",
+        type=Path,
+        default=out,
+        help=f"{about}. Default: {out}",
     )
-    add("--seeds", type=int, default=4, help="recordings of a class. Default: 4")
-    add("--first-seed", type=int, default=0, help="fresh recordings. Default: 0")
+    add(
+        "--seeds", type=int, default=4, help="recordings of a class. Default: 4"
+    )
+    add(
+        "--first-seed", type=int, default=0, help="fresh recordings. Default: 0"
+    )
     add(
         "--hours",
         type=float,
@@ -70,20 +78,29 @@ def _stop(arguments: argparse.Namespace) -> str:
         tables.append(stop.table(stops, name))
         if name == "simulated":
             rules = stop.rules_table(stops)
-    texts = ["Simulated:", tables[0], "Real, cut off in the same way:", tables[1]]
+    texts = [
+        "Simulated:",
+        tables[0],
+        "Real, cut off in the same way:",
+        tables[1],
+    ]
     return "\n\n".join([*texts, _ABOUT_RULES, rules])
 
 
 def _ramps(arguments: argparse.Namespace) -> str:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    rows_of_seeds = in_parallel(ramps.ends, [(seed,) for seed in seeds], arguments.jobs)
+    rows_of_seeds = in_parallel(
+        ramps.ends, [(seed,) for seed in seeds], arguments.jobs
+    )
     return ramps.table([row for rows in rows_of_seeds for row in rows])
 
 
 def _together(arguments: argparse.Namespace) -> str:
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     tasks = {
-        f"{name} {seed}": (name, seed) for name in together.SIMULATED for seed in seeds
+        f"{name} {seed}": (name, seed)
+        for name in together.SIMULATED
+        for seed in seeds
     }
     path = arguments.rows / "together_simulated.jsonl"
     jobs = arguments.jobs
@@ -94,7 +111,9 @@ def _together(arguments: argparse.Namespace) -> str:
         if not rig.is_refused and len(rig.recordings) > 1
     ]
     recorded = {
-        f"{rig.name} {name}": (rig, name) for rig in rigs for name in rig.recordings
+        f"{rig.name} {name}": (rig, name)
+        for rig in rigs
+        for name in rig.recordings
     }
     rigs_solved = kept(
         arguments.rows / "together_real.jsonl", together.real, recorded, jobs
@@ -106,11 +125,17 @@ def _together(arguments: argparse.Namespace) -> str:
 
 def _alarms(arguments: argparse.Namespace) -> str:
     tasks = [(name, arguments.hours) for name in mount.WATCHED]
-    return mount.alarm_table([*in_parallel(mount.false_alarms, tasks, arguments.jobs)])
+    return mount.alarm_table(
+        [*in_parallel(mount.false_alarms, tasks, arguments.jobs)]
+    )
 
 
 def _delays(arguments: argparse.Namespace) -> str:
-    tasks = [(kind, seed) for kind in mount.SHIFTED for seed in range(arguments.seeds)]
+    tasks = [
+        (kind, seed)
+        for kind in mount.SHIFTED
+        for seed in range(arguments.seeds)
+    ]
     delays_of_tasks = in_parallel(mount.delays, tasks, arguments.jobs)
     return mount.delay_table(
         [delay for several in delays_of_tasks for delay in several]

@@ -84,7 +84,9 @@ def _pieces(
         pairs = synchronise(made.parent, made.child, 0.5)
         # Half a minute between the pieces: nothing runs across.
         later_ns = round(number * (kind.duration_s + 30.0)) * _SECOND_NS
-        yield PosePairs(pairs.stamps_ns + later_ns, pairs.Ts_pw_p, pairs.Ts_cw_c)
+        yield PosePairs(
+            pairs.stamps_ns + later_ns, pairs.Ts_pw_p, pairs.Ts_cw_c
+        )
 
 
 def _mount(name: str, seed: int) -> FloatArray:
@@ -107,7 +109,9 @@ def false_alarms(name: str, hours: float) -> Watched:
     for pairs in _pieces(name, 0, X, 3600.0 * hours):
         for _ in _fed(monitor, pairs):
             pass
-    return Watched(name, hours, int(monitor.alarm is not None), monitor.visible(600.0))
+    return Watched(
+        name, hours, int(monitor.alarm is not None), monitor.visible(600.0)
+    )
 
 
 def alarm_table(watched: Sequence[Watched]) -> str:
@@ -124,7 +128,9 @@ def alarm_table(watched: Sequence[Watched]) -> str:
                 "hours": f"{sum(drive.hours for drive in group):g}",
                 "alarms": sum(drive.alarms for drive in group),
                 "x, y, z (cm)": triple(visible[:3], 100.0, ".2g"),
-                "about x, y, z (deg)": triple(np.degrees(visible[3:]), form=".2g"),
+                "about x, y, z (deg)": triple(
+                    np.degrees(visible[3:]), form=".2g"
+                ),
             }
         )
     hours = sum(drive.hours for drive in watched)
@@ -152,7 +158,9 @@ def delays(kind: str, seed: int) -> list[Delay]:
         axis = int(rng.integers(3)) + (3 if size.endswith("deg") else 0)
         xi = np.kron(np.eye(2), X[:3, :3].T) @ (np.eye(6)[axis] * shift)
         announced = float(before.visible(600.0)[axis] / shift)
-        seconds = _seconds_until_seen(copy.deepcopy(before), parts[n_before:], xi)
+        seconds = _seconds_until_seen(
+            copy.deepcopy(before), parts[n_before:], xi
+        )
         delays_of_kind.append(Delay(kind, size, seconds, announced))
     return delays_of_kind
 
@@ -162,7 +170,9 @@ def _seconds_until_seen(
 ) -> float:
     before = monitor.seconds
     for pairs in parts:
-        moved = PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi))
+        moved = PosePairs(
+            pairs.stamps_ns, pairs.Ts_pw_p, pairs.Ts_cw_c @ se3.exp(xi)
+        )
         for _ in _fed(monitor, moved):
             if monitor.alarm is not None:
                 return float(monitor.seconds - before)
@@ -183,7 +193,11 @@ def delay_table(delays_measured: Sequence[Delay]) -> str:
         # A value of at most 1: the monitor said beforehand that ten minutes show this shift.
         announced, others = (
             np.array(
-                [delay.seconds for delay in some if (delay.announced <= 1.0) == is_said]
+                [
+                    delay.seconds
+                    for delay in some
+                    if (delay.announced <= 1.0) == is_said
+                ]
             )
             for is_said in (True, False)
         )

@@ -92,7 +92,9 @@ def ends(seed: int) -> list[End]:
 def _steps(seed: int) -> tuple[list[Step], list[Excitation]]:
     """Return the results of the parts of a recording, and the motion of the last minute of each."""
     name = CLASSES_IN_TURN[seed % 2]
-    kind = replace(CLASSES[name], motion=agv_on_request, duration_s=_ENDS_S[-1] + 5.0)
+    kind = replace(
+        CLASSES[name], motion=agv_on_request, duration_s=_ENDS_S[-1] + 5.0
+    )
     made = simulate(kind, (9150, seed))  # a key that no other study has
     start_ns = int(made.parent.stamps_ns[0])
     steps = []
@@ -115,14 +117,21 @@ def _end_of_node(steps: Sequence[Step], newest: Sequence[Excitation]) -> End:
     goal = Goal(FACTOR * TARGET)
     times: list[tuple[float, float]] = []
     change_s = 0.0
-    for index, (step, last_minute) in enumerate(zip(steps, newest, strict=True)):
+    for index, (step, last_minute) in enumerate(
+        zip(steps, newest, strict=True)
+    ):
         progress = goal.add(step.calibration, step.seen, (), last_minute)
         motion_s = step.seen.motion_s
         if progress.done:
-            ratios = np.array([left_s / (motion_s - at_s) for at_s, left_s in times])
+            ratios = np.array(
+                [left_s / (motion_s - at_s) for at_s, left_s in times]
+            )
             n_good_times = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
             row = End(
-                "", n_times=len(times), n_good_times=n_good_times, change_s=change_s
+                "",
+                n_times=len(times),
+                n_good_times=n_good_times,
+                change_s=change_s,
             )
             return _with_error(row, steps, index)
         if progress.will_not_get_there and index:

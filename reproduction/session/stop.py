@@ -77,12 +77,16 @@ class Rule(NamedTuple):
     longest_s: float
 
     def __str__(self) -> str:
-        shortest = f"{self.shortest_s:g} s" if self.shortest_s else "two results"
+        shortest = (
+            f"{self.shortest_s:g} s" if self.shortest_s else "two results"
+        )
         confirmation = f"for {shortest}"
         if self.of_motion:
             confirmation = f"for {self.of_motion:.0%} of the motion, {shortest}"
             confirmation += (
-                f" to {self.longest_s:g} s" if self.longest_s < np.inf else " or more"
+                f" to {self.longest_s:g} s"
+                if self.longest_s < np.inf
+                else " or more"
             )
         return f"{self.of_target:g} of the target, {confirmation}"
 
@@ -237,7 +241,9 @@ def simulated(seeds: int, first_seed: int = 0) -> Iterator[Recorded]:
             n_seeds = seeds * 2 // len(classes)
             for seed in range(first_seed, first_seed + n_seeds):
                 key = (_KEY, seed, sorted(CLASSES).index(name))
-                made = simulate(replace(CLASSES[name], duration_s=duration_s), key)
+                made = simulate(
+                    replace(CLASSES[name], duration_s=duration_s), key
+                )
                 truth = Truth.within(made.T_parent_child, 0.0, 0.0)
                 yield Recorded(
                     f"{name} {seed}",
@@ -254,7 +260,11 @@ def real(rigs: Sequence[Rig]) -> Iterator[Recorded]:
         if rig.truth is not None:
             for name, recording in rig.recordings.items():
                 yield Recorded(
-                    f"{rig.name} {name}", rig.name, recording, rig.truth, rig.options
+                    f"{rig.name} {name}",
+                    rig.name,
+                    recording,
+                    rig.truth,
+                    rig.options,
                 )
 
 
@@ -262,7 +272,9 @@ def stops(recorded: Recorded) -> list[dict[str, Any]]:
     """Return a :class:`Stop`, as a dictionary, for every factor of the target and every rule."""
     steps = list(_steps(recorded))
     return [
-        vars(stop) for factor in FACTORS for stop in _stops(recorded, steps, factor)
+        vars(stop)
+        for factor in FACTORS
+        for stop in _stops(recorded, steps, factor)
     ]
 
 
@@ -281,7 +293,9 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
     """Yield the results of the parts. Parts that cannot be solved are left out."""
     options: dict[str, Any] = dict(recorded.options)
     of_axes = prior_fields(options.pop("prior", {}))
-    options |= {name.replace("_", ".", 1): value for name, value in of_axes.items()}
+    options |= {
+        name.replace("_", ".", 1): value for name, value in of_axes.items()
+    }
     options = {"max_pairs": CalibratorConfig.max_pairs, **options}
     streams = recorded.recording.parent, recorded.recording.child
     of_parent, of_child = (stream.stamps_ns[[0, -1]] for stream in streams)
@@ -304,18 +318,25 @@ def _steps(recorded: Recorded) -> Iterator[Step]:
             seen = excitation(snapshot.pose_pairs)
         except (HandEyeCalibError, np.linalg.LinAlgError):
             continue
-        error = deviation(calibration.T_parent_child, recorded.truth.T_parent_child)
+        error = deviation(
+            calibration.T_parent_child, recorded.truth.T_parent_child
+        )
         yield Step(end_s, error, calibration, seen)
 
 
 def until(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
     """Return the poses up to a stamp (ns), at least three."""
     return trajectory[
-        : max(int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")), 3)
+        : max(
+            int(np.searchsorted(trajectory.stamps_ns, stamp_ns, side="right")),
+            3,
+        )
     ]
 
 
-def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator[Stop]:
+def _stops(
+    recorded: Recorded, steps: Sequence[Step], factor: float
+) -> Iterator[Stop]:
     """Yield the ends of the session: by the goal of the node, then by each of RULES."""
     goal = Goal(factor * TARGET)
     is_stuck = False
@@ -335,11 +356,15 @@ def _stops(recorded: Recorded, steps: Sequence[Step], factor: float) -> Iterator
         yield replace(stop, is_stuck=is_stuck)
     else:
         end_s = steps[end].seen.motion_s
-        ratios = np.array([left_s / (end_s - motion_s) for motion_s, left_s in times])
+        ratios = np.array(
+            [left_s / (end_s - motion_s) for motion_s, left_s in times]
+        )
         n_good = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
         yield replace(stop, n_times=len(times), n_good_times=n_good)
     for rule in RULES:
-        yield _stop(recorded, str(rule), steps, factor, end_of(rule, steps, factor))
+        yield _stop(
+            recorded, str(rule), steps, factor, end_of(rule, steps, factor)
+        )
 
 
 def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
@@ -361,16 +386,23 @@ def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:
 
 
 def _stop(
-    recorded: Recorded, rule: str, steps: Sequence[Step], factor: float, end: int | None
+    recorded: Recorded,
+    rule: str,
+    steps: Sequence[Step],
+    factor: float,
+    end: int | None,
 ) -> Stop:
     """Return the end of a session after the part ``end``, which is None if no part ends it."""
     if end is None:
         return Stop(recorded.kind, rule, factor, is_stuck=False)
     worst = [
-        _worst(step.error, recorded.truth.sigmas, factor) for step in steps[: end + 1]
+        _worst(step.error, recorded.truth.sigmas, factor)
+        for step in steps[: end + 1]
     ]
     # From here on all errors stay within their targets.
-    first = max((i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0)
+    first = max(
+        (i + 1 for i, ratio in enumerate(worst) if ratio > 1.0), default=0
+    )
     return Stop(
         kind=recorded.kind,
         rule=rule,
@@ -390,7 +422,9 @@ def _worst(error: FloatArray, truth_sigmas: FloatArray, factor: float) -> float:
     truth are left out.
     """
     unsure = 2.0 * truth_sigmas
-    excess = np.where(np.isfinite(unsure), np.maximum(np.abs(error) - unsure, 0.0), 0.0)
+    excess = np.where(
+        np.isfinite(unsure), np.maximum(np.abs(error) - unsure, 0.0), 0.0
+    )
     return float((excess / (factor * TARGET)).max())
 
 
@@ -401,12 +435,18 @@ def table(stops: Sequence[Stop], which: str) -> str:
     """
     rows = []
     for factor in FACTORS:
-        of_factor = [stop for stop in stops if stop.factor == factor and not stop.rule]
+        of_factor = [
+            stop for stop in stops if stop.factor == factor and not stop.rule
+        ]
         kinds = {
-            stop.kind for stop in of_factor if factor == 1.0 and which == "simulated"
+            stop.kind
+            for stop in of_factor
+            if factor == 1.0 and which == "simulated"
         }
         for kind in (kind for kind in KINDS if kind in kinds):
-            rows.append(_row(kind, factor, [s for s in of_factor if s.kind == kind]))
+            rows.append(
+                _row(kind, factor, [s for s in of_factor if s.kind == kind])
+            )
         rows.append(_row("**all**", factor, of_factor))
     return markdown_table(rows)
 
@@ -418,7 +458,9 @@ def rules_table(stops: Sequence[Stop]) -> str:
         row: dict[str, object] = {"rule": rule or "**of the node**"}
         for factor in FACTORS:
             of_rule = [
-                stop for stop in stops if stop.rule == rule and stop.factor == factor
+                stop
+                for stop in stops
+                if stop.rule == rule and stop.factor == factor
             ]
             columns = _row("", factor, of_rule)
             ended = f"{columns['told to stop']} of {len(of_rule)}"
@@ -441,9 +483,13 @@ def _row(kind: str, factor: float, stops: Sequence[Stop]) -> dict[str, object]:
         "target": f"{100 * factor * TARGET[0]:g} cm, {np.degrees(factor * TARGET[3]):.1f} deg",
         "number": len(stops),
         "told to stop": len(done),
-        "worst axis within target": f"{np.mean(worst <= 1.0):.0%}" if done else "-",
+        "worst axis within target": f"{np.mean(worst <= 1.0):.0%}"
+        if done
+        else "-",
         "largest error / target": f"{worst.max():.2f}" if done else "-",
-        "seconds beyond earliest": f"{np.median(beyond):.0f}" if len(beyond) else "-",
+        "seconds beyond earliest": f"{np.median(beyond):.0f}"
+        if len(beyond)
+        else "-",
         "not getting there": sum(stop.is_stuck for stop in stops),
         "time left within a factor of two": _share_of_times(done),
     }

@@ -48,12 +48,16 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
     """Plain results of the recordings of a simulated rig, its extrinsic, and those in each."""
     kind = dataclasses.replace(CLASSES[name], duration_s=_SECONDS)
     rng = np.random.default_rng((31, seed, sorted(CLASSES).index(name)))
-    X = simulate(dataclasses.replace(kind, duration_s=5.0), (32, seed)).T_parent_child
+    X = simulate(
+        dataclasses.replace(kind, duration_s=5.0), (32, seed)
+    ).T_parent_child
     scatter = 2.0 ** rng.uniform(-1.0, 1.0) * _SCATTER
     results = {}
     own = {}
     for number in range(_RECORDINGS):
-        made = simulate(kind, (33, seed, number, sorted(CLASSES).index(name)), X)
+        made = simulate(
+            kind, (33, seed, number, sorted(CLASSES).index(name)), X
+        )
         result = calibrate(made.parent, made.child, checks=False)
         moved = se3.exp(scatter * rng.standard_normal(6))
         result = dataclasses.replace(
@@ -85,7 +89,8 @@ def rigs_of(
         }
         exact = Truth.within(np.array(plain["truth"]), 0.0, 0.0)
         own = {
-            key: Truth.within(np.array(T), 0.0, 0.0) for key, T in plain["own"].items()
+            key: Truth.within(np.array(T), 0.0, 0.0)
+            for key, T in plain["own"].items()
         }
         yield Recorded(f"simulated {name.split()[0]}", results, exact, own)
     euroc: dict[str, Calibration] = {}
@@ -98,7 +103,9 @@ def rigs_of(
         yield Recorded(rig.name, results, rig.truth)
         if rig.name.startswith("euroc"):
             truth = rig.truth
-            euroc |= {f"{rig.name} {name}": result for name, result in results.items()}
+            euroc |= {
+                f"{rig.name} {name}": result for name, result in results.items()
+            }
     if euroc:
         yield Recorded("euroc, both", euroc, truth)
 
@@ -107,16 +114,23 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
     """Errors and coverage by rig; and what is told of recordings that belong, and that do not."""
     rng = np.random.default_rng((34, seed))
     kinds = dict.fromkeys(rig.rig for rig in rigs if rig.truth)
-    rows = [_row(kind, [rig for rig in rigs if rig.rig == kind]) for kind in kinds]
+    rows = [
+        _row(kind, [rig for rig in rigs if rig.rig == kind]) for kind in kinds
+    ]
     named = wrong = cases = accused = several = moved = pairs = 0
     for rig in rigs:
         whole = [rig.results] if len(rig.results) > 3 else []
         for some in (*whole, *_subsets(rig.results, 3)[:2]):
             agreement = together(some).parts["together"]
             several += 1
-            accused += agreement is not None and agreement.kind in ("one off", "moved")
+            accused += agreement is not None and agreement.kind in (
+                "one off",
+                "moved",
+            )
             foreign = str(rng.choice([*some]))
-            out = _left_out(dict(some) | {foreign: _knocked(some[foreign], rng)})
+            out = _left_out(
+                dict(some) | {foreign: _knocked(some[foreign], rng)}
+            )
             cases = cases + 1
             named = named + (out == {foreign})
             wrong += bool(out - {foreign})
@@ -135,7 +149,8 @@ def _subsets(
     results: Mapping[str, Calibration], count: int
 ) -> list[dict[str, Calibration]]:
     return [
-        {name: results[name] for name in some} for some in combinations(results, count)
+        {name: results[name] for name in some}
+        for some in combinations(results, count)
     ]
 
 
@@ -147,17 +162,31 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
         for rig in rigs:
             assert rig.truth is not None
             for some in _subsets(rig.results, count):
-                joint = together(some) if count > 1 else next(iter(some.values()))
+                joint = (
+                    together(some) if count > 1 else next(iter(some.values()))
+                )
                 is_comparable = np.isfinite(rig.truth.sigmas) & np.isfinite(
                     joint.sigmas_measured
                 )
-                error = deviation(joint.T_parent_child, rig.truth.T_parent_child)
+                error = deviation(
+                    joint.T_parent_child, rig.truth.T_parent_child
+                )
                 # One recording shows its own mount only: its interval is of that.
-                of = rig.own.get(min(some), rig.truth) if count == 1 else rig.truth
+                of = (
+                    rig.own.get(min(some), rig.truth)
+                    if count == 1
+                    else rig.truth
+                )
                 apart = deviation(joint.T_parent_child, of.T_parent_child)
-                stated = joint.sigmas_measured if "simulated" in kind else joint.sigmas
+                stated = (
+                    joint.sigmas_measured
+                    if "simulated" in kind
+                    else joint.sigmas
+                )
                 sigmas = np.hypot(stated, rig.truth.sigmas)
-                inside.extend((np.abs(apart) < _NORMAL_90 * sigmas)[is_comparable])
+                inside.extend(
+                    (np.abs(apart) < _NORMAL_90 * sigmas)[is_comparable]
+                )
                 parts = np.split(error * is_comparable, 2)
                 errors.append([float(np.linalg.norm(axes)) for axes in parts])
         words = ("-", "-")
@@ -167,14 +196,21 @@ def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
                 f"{1e3 * metres:.1f} mm, {np.degrees(radians):.3f} deg",
                 f"{100 * np.mean(inside):.0f} %",
             )
-        row |= {f"error of {title}": words[0], f"90 % covers, {title}": words[1]}
+        row |= {
+            f"error of {title}": words[0],
+            f"90 % covers, {title}": words[1],
+        }
     return row
 
 
 def _left_out(results: Mapping[str, Calibration]) -> set[str]:
     agreement = together(results).parts["together"]
     assert agreement is not None
-    return {recording.name for recording in agreement.recordings if recording.left_out}
+    return {
+        recording.name
+        for recording in agreement.recordings
+        if recording.left_out
+    }
 
 
 def _knocked(result: Calibration, rng: np.random.Generator) -> Calibration:

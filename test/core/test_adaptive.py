@@ -95,7 +95,9 @@ def with_noise(streams, seed):
 NO_SYSTEMATIC_ERROR = np.zeros(increments.N_SYSTEMATIC)
 
 
-def linearised(streams, T_parent_child=T_PARENT_CHILD, parameters=NO_SYSTEMATIC_ERROR):
+def linearised(
+    streams, T_parent_child=T_PARENT_CHILD, parameters=NO_SYSTEMATIC_ERROR
+):
     course = increments.course_of(streams, T_PARENT_CHILD)
     return increments.linearise(
         streams,
@@ -172,7 +174,8 @@ def drift_of(noise):
 
 @pytest.mark.statistics
 @pytest.mark.parametrize(
-    ("white", "drift"), [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))]
+    ("white", "drift"),
+    [((0.004, 0.006), (0.0, 0.0)), ((0.001, 0.001), (0.004, 0.003))],
 )
 def test_the_noise_levels_are_recovered(white, drift):
     levels = []
@@ -267,7 +270,9 @@ def solved_with_lasting(kind, seed):
     solution = estimator.solve(stamps(600), parent, child)
 
     processes = [
-        process for process in solution.noise.lasting if process.part == added.part
+        process
+        for process in solution.noise.lasting
+        if process.part == added.part
     ]
     strongest = max(processes, key=lambda process: process.sigma)
     # Rotations fixed to the body are no process: the scatter of the tenths has to state them.
@@ -311,11 +316,17 @@ def test_flicker_is_stated_beyond_what_was_found():
     stated = estimator.solve(stamps(500), parent, child)
     measured = estimator.solve(stamps(500), parent, child, tuning=without)
 
-    unseen = stated.cov_parent_child_in_child - measured.cov_parent_child_in_child
+    unseen = (
+        stated.cov_parent_child_in_child - measured.cov_parent_child_in_child
+    )
     unseen_variances = np.diag(unseen)[:3]
     unseen_m = np.sqrt(unseen_variances)
-    assert (unseen_m > 0.2e-3).all(), f"undetected errors of {unseen_m} m: too small"
-    assert (unseen_m < 4e-3).all(), f"undetected errors of {unseen_m} m: too large"
+    assert (unseen_m > 0.2e-3).all(), (
+        f"undetected errors of {unseen_m} m: too small"
+    )
+    assert (unseen_m < 4e-3).all(), (
+        f"undetected errors of {unseen_m} m: too large"
+    )
 
 
 @pytest.mark.statistics
@@ -405,7 +416,9 @@ def test_a_lag_is_not_taken_for_a_lever():
 
     error_m = np.median(errors_m)
     error_without_m = np.median(errors_without_m)
-    assert error_m < 0.3 * error_without_m, "the lag still disturbs the lever arm"
+    assert error_m < 0.3 * error_without_m, (
+        "the lag still disturbs the lever arm"
+    )
 
 
 def test_on_flat_ground_no_sideways_slip_is_assumed():
@@ -436,10 +449,15 @@ def test_poses_wrong_by_themselves_are_bridged():
     assert_array_equal(np.flatnonzero(solution.spikes), spikes)
     assert_array_equal(np.flatnonzero(solution.jumps), [99])
     assert_array_equal(np.flatnonzero(solution.left_out), steps)
-    assert_allclose(solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3)
+    assert_allclose(
+        solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3
+    )
     description = solution.describe(stamps(150))
     words = " ".join(description.in_words)
-    assert "5 outlier poses, left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s" in words
+    assert (
+        "5 outlier poses, left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s"
+        in words
+    )
     assert "1 jump of a trajectory, just before 10.000 s" in words
 
 
@@ -534,12 +552,16 @@ def test_flat_ground_hides_the_height_and_only_that(level):
         disturbed(child_of(parent), 2, level, level),
     )
     solution = estimator.solve(stamps(200), parent, child)
-    assessment = assess_adaptive(PosePairs(stamps(200), parent, child), solution)
+    assessment = assess_adaptive(
+        PosePairs(stamps(200), parent, child), solution
+    )
     verdicts = {dof.name: dof.verdict for dof in assessment.observability}
-    assert [axis for axis in verdicts if verdicts[axis] is DofVerdict.UNOBSERVABLE] == [
-        "z"
-    ]
-    assert_allclose(solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01)
+    assert [
+        axis for axis in verdicts if verdicts[axis] is DofVerdict.UNOBSERVABLE
+    ] == ["z"]
+    assert_allclose(
+        solution.T_parent_child[:2, 3], T_PARENT_CHILD[:2, 3], atol=0.01
+    )
 
 
 def test_no_motion_at_all_is_no_number():
@@ -561,7 +583,9 @@ def mixture(number):
     config = DriveConfig(poses=200)
     drive = simulate_drive((0, number), config)
     random = np.random.default_rng((0, number, 0))
-    parent, child = add_noise(drive.parent.poses, drive.child.poses, MIXTURE, random)
+    parent, child = add_noise(
+        drive.parent.poses, drive.child.poses, MIXTURE, random
+    )
     pairs = PosePairs(drive.parent.stamps_ns, parent, child)
     return pairs, drive.T_parent_child
 
@@ -573,7 +597,9 @@ def test_a_drift_that_a_mount_askew_nearly_explains_is_found():
     n_biased = 0
     for number in range(6):
         poses, truth = mixture(number)
-        solution = estimator.solve(poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c)
+        solution = estimator.solve(
+            poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c
+        )
         n_biased += "bias" in solution.systematic
         covariance = assess_adaptive(poses, solution).cov_parent_child_in_child
         stated = replace(solution, cov_parent_child_in_child=covariance)

@@ -49,7 +49,9 @@ def errors_and_covariances(n_runs, estimate):
             motions.disturbed(child, 2 * run + 1, 0.005, 0.005),
         )
         errors.append(
-            se3.log(se3.inverse(solution.T_parent_child) @ motions.T_PARENT_CHILD)
+            se3.log(
+                se3.inverse(solution.T_parent_child) @ motions.T_PARENT_CHILD
+            )
         )
         covariances.append(covariance)
     return np.array(errors), np.array(covariances)
@@ -142,7 +144,9 @@ class TestFloor:
         parent, child = streams()
         method = Method("dnl")
         pairs = motion_pairs(parent.poses, child.poses, "B5")
-        scaled_pairs = motion_pairs(parent.poses, child.scaled(1.01).poses, "B5")
+        scaled_pairs = motion_pairs(
+            parent.poses, child.scaled(1.01).poses, "B5"
+        )
         answer = method.solve(pairs)
         scaled_answer = method.solve(scaled_pairs)
         T = answer.T_parent_child
@@ -182,7 +186,9 @@ class TestFloor:
         assert_allclose(sigmas[:3], 0.013)
 
         parent, child = streams()
-        fast = hec.calibrate(parent.scaled(20.0), child.scaled(20.0), checks=False)
+        fast = hec.calibrate(
+            parent.scaled(20.0), child.scaled(20.0), checks=False
+        )
         allowance_m = fast.allowance[:3]
         assert allowance_m.min() > 2 * common_mode.FLOOR_TRANSLATION
 
@@ -195,15 +201,21 @@ class TestFloor:
         zero = np.zeros(600)
         positions = np.column_stack([x, zero, zero])
         still = np.zeros((600, 3))
-        assert common_mode.usual_speed(stamps_ns, positions) == pytest.approx(2.0)
+        assert common_mode.usual_speed(stamps_ns, positions) == pytest.approx(
+            2.0
+        )
         assert common_mode.usual_speed(stamps_ns, still) == 0.0
 
     def test_exact_poses_have_none(self):
         both = hec.calibrate(
             *streams(), parent_kind="exact", child_kind="exact", checks=False
         )
-        exact_child = hec.calibrate(*streams(), child_kind="exact", checks=False)
-        odometry = hec.calibrate(*streams(), child_kind="odometry", checks=False)
+        exact_child = hec.calibrate(
+            *streams(), child_kind="exact", checks=False
+        )
+        odometry = hec.calibrate(
+            *streams(), child_kind="odometry", checks=False
+        )
         assert not both.allowance.any()
         half = 0.5 * odometry.covariance_allowance
         assert_allclose(exact_child.covariance_allowance, half)
@@ -211,14 +223,21 @@ class TestFloor:
     @pytest.mark.parametrize("method", ["auto", "adaptive", "dnlo", "park"])
     def test_every_result_has_it_beside_the_covariance(self, method):
         result = hec.calibrate(*streams(), method=method, checks=False)
-        assert_allclose(result.allowance[3:], common_mode.FLOOR_ROTATION, rtol=1e-3)
-        assert 0.999 * common_mode.FLOOR_TRANSLATION < result.allowance[:3].max() < 0.01
+        assert_allclose(
+            result.allowance[3:], common_mode.FLOOR_ROTATION, rtol=1e-3
+        )
+        assert (
+            0.999 * common_mode.FLOOR_TRANSLATION
+            < result.allowance[:3].max()
+            < 0.01
+        )
         assert result.sigmas_measured[3:].max() < common_mode.FLOOR_ROTATION
         assert_allclose(
             result.sigmas**2, result.sigmas_measured**2 + result.allowance**2
         )
         assert_array_equal(
-            result.covariance, result.covariance_measured + result.covariance_allowance
+            result.covariance,
+            result.covariance_measured + result.covariance_allowance,
         )
 
 
@@ -273,10 +292,13 @@ class TestWhichAnswerStands:
         result = hec.calibrate(*streams, method="auto", checks=False)
         model = hec.calibrate(*streams, method="adaptive", checks=False)
         assert_array_equal(result.T_parent_child, model.T_parent_child)
-        assert_array_equal(result.covariance_measured, model.covariance_measured)
+        assert_array_equal(
+            result.covariance_measured, model.covariance_measured
+        )
         assert (result.method, result.reference) == ("adaptive", "increments")
         assert (
-            result.method_reason == "auto: adaptive, because its noise model works here"
+            result.method_reason
+            == "auto: adaptive, because its noise model works here"
         )
         assert result.noise == model.noise
         assert model.method_reason == ""
@@ -305,7 +327,9 @@ class TestWhichAnswerStands:
         streams = noisy_streams()
         result = hec.calibrate(*streams, method="auto", checks=False)
         reference = result.reference
-        dnlo = hec.calibrate(*streams, method="dnlo", reference=reference, checks=False)
+        dnlo = hec.calibrate(
+            *streams, method="dnlo", reference=reference, checks=False
+        )
         assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
         assert (result.method, result.noise) == ("dnlo", None)
         assert (
@@ -328,7 +352,9 @@ class TestWhichAnswerStands:
         monkeypatch.setattr(
             estimation,
             "excess_covariance",
-            lambda _, opinions: 1e-4 * np.eye(6) if opinions else np.zeros((6, 6)),
+            lambda _, opinions: (
+                1e-4 * np.eye(6) if opinions else np.zeros((6, 6))
+            ),
         )
         streams = noisy_streams()
         result = hec.calibrate(*streams, method="auto", checks=False)
@@ -343,7 +369,9 @@ class TestWhichAnswerStands:
         flight = real_data.euroc("vislam_ba", "v1_02")
         result = hec.calibrate(flight.parent, flight.child)
         assert result.method == "adaptive"
-        metres, radians = absolute_errors(result.T_parent_child, real_data.EUROC_TRUTH)
+        metres, radians = absolute_errors(
+            result.T_parent_child, real_data.EUROC_TRUTH
+        )
         assert metres < 0.013
         assert np.degrees(radians) < 0.3
         assert result.verdict is Verdict.USE_WITH_CARE
@@ -351,13 +379,20 @@ class TestWhichAnswerStands:
     def test_that_of_dnlo_if_a_reference_is_given(self):
         streams = noisy_streams(60)
 
-        result = hec.calibrate(*streams, method="auto", reference="B3", checks=False)
-        dnlo = hec.calibrate(*streams, method="dnlo", reference="B3", checks=False)
+        result = hec.calibrate(
+            *streams, method="auto", reference="B3", checks=False
+        )
+        dnlo = hec.calibrate(
+            *streams, method="dnlo", reference="B3", checks=False
+        )
 
         assert_array_equal(result.T_parent_child, dnlo.T_parent_child)
         assert result.method == "dnlo"
         assert result.reference == "B3"
-        assert result.method_reason == "auto: dnlo, because the user set reference B3"
+        assert (
+            result.method_reason
+            == "auto: dnlo, because the user set reference B3"
+        )
 
 
 def test_the_reference_whose_answer_is_nearest_is_chosen():

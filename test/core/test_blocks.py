@@ -59,15 +59,21 @@ SUMS = {
     "total": (lambda blocks: blocks.total, products),
     "without": (
         lambda blocks: blocks.without(),
-        lambda rows: [products(without(rows, block)) for block in range(N_BLOCKS)],
+        lambda rows: [
+            products(without(rows, block)) for block in range(N_BLOCKS)
+        ],
     ),
     "before": (
         lambda blocks: blocks.before(CUTS),
-        lambda rows: [products(np.concatenate(split(rows)[:cut])) for cut in CUTS],
+        lambda rows: [
+            products(np.concatenate(split(rows)[:cut])) for cut in CUTS
+        ],
     ),
     "since": (
         lambda blocks: blocks.since(CUTS),
-        lambda rows: [products(np.concatenate(split(rows)[cut:])) for cut in CUTS],
+        lambda rows: [
+            products(np.concatenate(split(rows)[cut:])) for cut in CUTS
+        ],
     ),
     "merged": (
         lambda blocks: blocks.merged(2).sums,
@@ -164,7 +170,9 @@ def test_probes_without_noise_take_the_bias_of_noisy_columns_away():
     assert unbiased == pytest.approx(2.0, abs=0.05)
 
 
-def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(rows):
+def test_the_evidence_of_a_shift_is_that_of_the_difference_of_both_answers(
+    rows,
+):
     no_prior = np.zeros((4, 4))
     unknowns = [0, 1, 2, 3]
     blocks = Blocks.of_rows(rows, N_BLOCKS)

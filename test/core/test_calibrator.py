@@ -102,7 +102,9 @@ def test_adaptive_adds_the_lag_it_finds_to_a_time_offset_unless_that_was_set():
         snapshot = dataclasses.replace(whole, config=config)
 
         estimated = snapshot.estimate()
-        result = calibrate(parent, child, method="adaptive", time_offset=offset_s)
+        result = calibrate(
+            parent, child, method="adaptive", time_offset=offset_s
+        )
 
         assert estimated.time_offset_s == pytest.approx(-0.02, abs=1e-3)
         assert result.time_offset_s == offset_s
@@ -112,7 +114,9 @@ def test_time_offset_and_scale_are_applied_to_the_child():
     parent, child = drive()
     late = child.shifted(-12.5).scaled(1 / 2.5)
 
-    result = calibrate(parent, late, reference="B3", time_offset=12.5, scale=2.5)
+    result = calibrate(
+        parent, late, reference="B3", time_offset=12.5, scale=2.5
+    )
 
     assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)
     assert result.time_offset_s == 12.5
@@ -142,11 +146,15 @@ class TestRefusals:
 
     def test_frames(self):
         calibrator = Calibrator()
-        with pytest.raises(InputError, match="parent stream's sensor frame is empty"):
+        with pytest.raises(
+            InputError, match="parent stream's sensor frame is empty"
+        ):
             calibrator.set_frame("parent", "")
         calibrator.set_frame("parent", "lidar")
         calibrator.set_frame("parent", "lidar")
-        with pytest.raises(InputError, match="changed from 'lidar' to 'camera'"):
+        with pytest.raises(
+            InputError, match="changed from 'lidar' to 'camera'"
+        ):
             calibrator.set_frame("parent", "camera")
         calibrator.set_frame("child", "lidar")
         with pytest.raises(InputError, match="both streams name 'lidar'"):
@@ -181,7 +189,9 @@ def test_missing_data_is_named(n_poses, parent_s, child_s, options, message):
     shifted_child = child.shifted(child_s)
     with pytest.raises(NotEnoughDataError, match=message):
         calibrate(shifted_parent, shifted_child, **options)
-    with pytest.raises(NotEnoughDataError, match="no poses on the parent stream"):
+    with pytest.raises(
+        NotEnoughDataError, match="no poses on the parent stream"
+    ):
         Calibrator().estimate()
 
 
@@ -216,7 +226,11 @@ def test_a_snapshot_does_not_change_when_poses_come_in():
 # 10 s at 10 Hz, so that a short drive outgrows the buffers many times; half a second for late
 # arrivals.
 SMALL = BufferLimits(
-    capacity=500, pairing_starts=100, batch=16, batch_every=4, late_ns=500_000_000
+    capacity=500,
+    pairing_starts=100,
+    batch=16,
+    batch_every=4,
+    late_ns=500_000_000,
 )
 
 
@@ -302,11 +316,13 @@ def test_late_and_swapped_messages_within_the_horizon_change_nothing(seed):
     late = [sequence[k] for k in np.argsort(arrival)]
     calibrator = play(late)
     refused = [
-        calibrator.statistics(stream).refused_late for stream in ("parent", "child")
+        calibrator.statistics(stream).refused_late
+        for stream in ("parent", "child")
     ]
     assert refused == [0, 0]
     assert np.array_equal(
-        calibrator.estimate().T_parent_child, play(sequence).estimate().T_parent_child
+        calibrator.estimate().T_parent_child,
+        play(sequence).estimate().T_parent_child,
     )
 
 
@@ -384,7 +400,9 @@ def test_the_whole_session_is_checked_not_only_its_end(max_pairs):
     wrong_sequence = by_stamp(parent, reordered(child))
 
     sound = play(sequence, max_pairs=max_pairs).snapshot()
-    wrong = play(wrong_sequence, max_pairs=max_pairs, time_offset=0.5).snapshot()
+    wrong = play(
+        wrong_sequence, max_pairs=max_pairs, time_offset=0.5
+    ).snapshot()
 
     assert check(sound).findings == ()
     assert len(sound.unpaired[0]) < 150

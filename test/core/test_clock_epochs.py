@@ -15,7 +15,11 @@ from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.results import load_result
@@ -89,7 +93,9 @@ def test_an_offset_beyond_64_bits_is_one_line():
     _, child = pair(0.0)
     with pytest.raises(InputError, match="beyond 64 bits of nanoseconds"):
         child.shifted(9e9)
-    with pytest.raises(ConfigError, match="time_offset must be at most 9200000000.0 s"):
+    with pytest.raises(
+        ConfigError, match="time_offset must be at most 9200000000.0 s"
+    ):
         CalibratorConfig(time_offset=1e10)
     assert CalibratorConfig(time_offset=1.7e9).time_offset == 1.7e9
 
@@ -127,6 +133,8 @@ def test_a_stream_that_froze_does_not_hide_the_offset(frozen):
 
     assert result.time_offset_s == pytest.approx(offset_s, abs=0.02)
     assert result.verdict.value == "DO NOT USE"
-    (freeze,) = (finding for finding in result.findings if finding.code == "frozen")
+    (freeze,) = (
+        finding for finding in result.findings if finding.code == "frozen"
+    )
     assert freeze.stream == frozen
     assert freeze.severity.value == "error"

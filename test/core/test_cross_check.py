@@ -42,7 +42,10 @@ def answers():
     ]
     return (
         calibrate(*whole, reference="B5"),
-        [assessed(calibrate(*whole, reference=name)) for name in ("B3", "B10", "B20")],
+        [
+            assessed(calibrate(*whole, reference=name))
+            for name in ("B3", "B10", "B20")
+        ],
         [assessed(calibrate(*half, reference="B5")) for half in halves],
     )
 
@@ -67,7 +70,9 @@ def contradictions(calibration, *answers):
     cross_check = compare_answers(calibration, *answers)
     reasons = dataclasses.replace(calibration, cross_check=cross_check).reasons
     return [
-        reason.sentence for reason in reasons if reason.rule.partition("_")[0] in KINDS
+        reason.sentence
+        for reason in reasons
+        if reason.rule.partition("_")[0] in KINDS
     ]
 
 
@@ -99,9 +104,13 @@ def test_answers_to_good_data_agree_and_few_or_odd_ones_do_not_count(answers):
     assert read_back.cross_check == cross_check
 
 
-def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(answers):
+def test_other_methods_that_lie_elsewhere_are_named_with_axis_and_distance(
+    answers,
+):
     calibration, others, _ = answers
-    (sentence,) = contradictions(calibration, [moved(other, 0.3) for other in others])
+    (sentence,) = contradictions(
+        calibration, [moved(other, 0.3) for other in others]
+    )
     # 0.3 m is the median: 0.44 m for a normal variable.
     assert sentence.startswith(
         "robust least squares disagrees about x by 44 cm; without this "
@@ -117,7 +126,9 @@ def test_halves_that_lie_apart_are_named(answers):
     of_halves = column(cross_check, "of_halves")
     assert of_halves[0] == pytest.approx(0.2, abs=0.02)
     (sentence,) = contradictions(calibration, others, halves)
-    assert sentence.startswith("the two halves of the recording disagree about x by")
+    assert sentence.startswith(
+        "the two halves of the recording disagree about x by"
+    )
 
 
 @pytest.mark.parametrize("blind", [0, 1])
@@ -132,7 +143,9 @@ def test_halves_are_not_compared_on_an_axis_that_one_of_them_hardly_sees(
         dofs = list(halves[blind].observability)
         dofs[axis] = dataclasses.replace(dofs[axis], sigma=times * other_sigma)
         pair = list(halves)
-        pair[blind] = dataclasses.replace(halves[blind], observability=tuple(dofs))
+        pair[blind] = dataclasses.replace(
+            halves[blind], observability=tuple(dofs)
+        )
         cross_check = compare_answers(calibration, others, pair)
         differences[times] = column(cross_check, "of_halves")
 
@@ -181,7 +194,9 @@ def straight_start(seed):
 
 
 @pytest.mark.parametrize("seed", [100, 700])
-def test_a_straight_start_is_no_mount_that_turned_about_the_direction_of_travel(seed):
+def test_a_straight_start_is_no_mount_that_turned_about_the_direction_of_travel(
+    seed,
+):
     result = calibrate(*straight_start(seed), checks=True)
     assert result.cross_check["yaw"].of_halves is not None
     assert result.cross_check["roll"].of_halves is None
@@ -223,7 +238,9 @@ def test_an_axis_that_no_other_reference_reveals_is_weak_and_used_with_care():
     assert alone.sigmas[2] < 0.1
     assert not alone.cross_check["z"].is_confirmed
     assert alone.verdict is Verdict.USE_WITH_CARE
-    (reason,) = (reason for reason in alone.reasons if reason.rule == "unconfirmed")
+    (reason,) = (
+        reason for reason in alone.reasons if reason.rule == "unconfirmed"
+    )
     assert reason.axes == ("z",)
     assert reason.sentence.startswith("only the noise model determines z to ")
 
@@ -321,7 +338,10 @@ def test_an_axis_known_by_a_prior_alone_counts_with_its_sigma(answers):
             *calibration.observability_measured[1:],
         ),
     )
-    assert contradictions(with_prior, [moved(other, 0.3) for other in others]) == []
+    assert (
+        contradictions(with_prior, [moved(other, 0.3) for other in others])
+        == []
+    )
 
 
 @pytest.fixture(scope="module")

@@ -119,7 +119,9 @@ def test_a_motion_without_noise_by_every_method(motion, method):
 
 @pytest.mark.parametrize("unit", [1e3, 1e-3])
 @pytest.mark.parametrize("kind", ["poses", "positions", "stops"])
-@pytest.mark.parametrize("motion", ["any", "about one axis", "constant rotation"])
+@pytest.mark.parametrize(
+    "motion", ["any", "about one axis", "constant rotation"]
+)
 def test_another_unit_of_length(motion, kind, unit):
     parent, child = both_poses(motion, unit)
     assert_clear_end(kind, STAMPS_NS, parent, child)
@@ -138,7 +140,9 @@ def test_another_unit_of_length_by_some_methods(motion, method, unit):
     assert_clear_end("poses", STAMPS_NS, parent, child, **options)
 
 
-@pytest.mark.parametrize("option", [{"scale": "estimate"}, {"time_offset": "estimate"}])
+@pytest.mark.parametrize(
+    "option", [{"scale": "estimate"}, {"time_offset": "estimate"}]
+)
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_an_estimated_scale_or_offset(motion, option):
     parent, child = both_poses(motion)
@@ -162,7 +166,9 @@ def test_few_poses(n_poses, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("rows", [[7], [*range(0, N_POSES, 4)], [*range(N_POSES)]])
+@pytest.mark.parametrize(
+    "rows", [[7], [*range(0, N_POSES, 4)], [*range(N_POSES)]]
+)
 def test_poses_that_are_not_finite(rows, kind):
     parent, child = both_poses("any")
     child[rows, 0, 3] = np.nan
@@ -198,12 +204,18 @@ def singular(monkeypatch):
 def test_dnlo_stands_in_if_no_noise_model_fits(singular):
     parent, child = both_poses("any", sigma=1e-3)
     result = calibrated("poses", STAMPS_NS, parent, child, checks=False)
-    reason = "auto: dnlo on reference B3, because no noise model fits these poses"
+    reason = (
+        "auto: dnlo on reference B3, because no noise model fits these poses"
+    )
     assert result.method_reason == reason
 
 
-@pytest.mark.parametrize("options", [{"method": "adaptive"}, {"method": "dnlo"}])
-def test_a_method_that_needs_the_noise_model_says_that_none_fits(singular, options):
+@pytest.mark.parametrize(
+    "options", [{"method": "adaptive"}, {"method": "dnlo"}]
+)
+def test_a_method_that_needs_the_noise_model_says_that_none_fits(
+    singular, options
+):
     parent, child = both_poses("any", sigma=1e-3)
     options = {"checks": False, **options}
     with pytest.raises(hec.HandEyeCalibError, match="no noise model fits"):

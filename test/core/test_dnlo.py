@@ -22,7 +22,9 @@ def brute_force_objective(costs, threshold, floor):
 
     n_pairs = len(costs)
     fewest = -np.ones((1, n_pairs))
-    answer = linprog(costs - threshold, A_ub=fewest, b_ub=[-floor], bounds=(0, 1))
+    answer = linprog(
+        costs - threshold, A_ub=fewest, b_ub=[-floor], bounds=(0, 1)
+    )
     return answer.fun + threshold * n_pairs
 
 
@@ -59,7 +61,9 @@ def test_outliers_are_rejected_and_reported(jumpy_pairs):
     assert solution.converged
     # the same data without rejection is far off, so the test above is not idle
     assert (
-        np.abs(all_pairs.solve_dnl(jumpy_pairs).T_parent_child - T_PARENT_CHILD).max()
+        np.abs(
+            all_pairs.solve_dnl(jumpy_pairs).T_parent_child - T_PARENT_CHILD
+        ).max()
         > 0.1
     )
 
@@ -114,9 +118,14 @@ def test_condensed_costs_are_the_matrix_costs(pairs):
         T_PARENT_CHILD,
         se3.exp(np.array([30.0, -4.0, 2.0, 2.0, 1.0, -1.0])),
     ):
-        condensed_costs = quadratic_form.condense(pairs) @ quadratic_form.monomials(T)
+        condensed_costs = quadratic_form.condense(
+            pairs
+        ) @ quadratic_form.monomials(T)
         assert_allclose(
-            condensed_costs, all_pairs.pair_costs(pairs, T), rtol=1e-12, atol=1e-12
+            condensed_costs,
+            all_pairs.pair_costs(pairs, T),
+            rtol=1e-12,
+            atol=1e-12,
         )
 
 
@@ -190,7 +199,9 @@ def false_minimum(Q, T_parent_child):
 
 
 @settings(max_examples=25)
-@given(seed=st.integers(0, 10_000), sigma=st.sampled_from([0.0, 1e-3, 0.02, 0.2]))
+@given(
+    seed=st.integers(0, 10_000), sigma=st.sampled_from([0.0, 1e-3, 0.02, 0.2])
+)
 @pytest.mark.parametrize("method", ["dnl", "dnlo"])
 def test_the_minimum_is_proved_and_a_false_one_is_not(method, seed, sigma):
     pairs = noisy_pairs(seed, sigma)
@@ -218,7 +229,9 @@ def test_the_false_minima_of_the_published_results_are_caught(name):
     pairs = motion_pairs(case.parent.poses, case.child.poses, reference)
     solution = Method("dnl").solve(pairs)
     assert Method("dnl").proved_global(pairs, solution) == "yes"
-    T_false, above = false_minimum(form_of(pairs, solution), solution.T_parent_child)
+    T_false, above = false_minimum(
+        form_of(pairs, solution), solution.T_parent_child
+    )
     assert above > 9 * solution.objective
     assert not is_global(form_of(pairs, solution), T_false)
 
@@ -228,12 +241,16 @@ def test_results_say_what_was_proved(tmp_path):
     Ts_pw_p = wandering_poses(60)
     stamps_ns = np.arange(60) * 100_000_000
     parent = hec.Trajectory(stamps_ns, Ts_pw_p)
-    child = hec.Trajectory(stamps_ns, child_of(Ts_pw_p, se3.exp(rng.normal(size=6))))
+    child = hec.Trajectory(
+        stamps_ns, child_of(Ts_pw_p, se3.exp(rng.normal(size=6)))
+    )
     proved = {
         method: hec.calibrate(parent, child, method=method, reference="B5")
         for method in ("dnl", "dnlo", "park")
     }
-    assert {method: result.proved_global for method, result in proved.items()} == {
+    assert {
+        method: result.proved_global for method, result in proved.items()
+    } == {
         "dnl": "yes",
         "dnlo": "yes",
         "park": "not tried",

@@ -5,11 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 from findings import codes_of
-from motions import as_trajectory, child_of, noisy_pair, planar_poses, wandering_poses
+from motions import (
+    as_trajectory,
+    child_of,
+    noisy_pair,
+    planar_poses,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.assessment import excitation
-from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
+from hand_eye_calib.core.assessment.covariance import (
+    hidden_axes,
+    lever_arm_products,
+)
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
@@ -51,7 +60,9 @@ def test_it_does_not_depend_on_the_world_and_hardly_on_the_number_of_poses():
     assert_allclose(moved.rotation, seen.rotation, atol=1e-9)
     many = seen_in(
         as_trajectory(poses).at(
-            np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(np.int64)
+            np.linspace(*as_trajectory(poses).stamps_ns[[0, -1]], 4000).astype(
+                np.int64
+            )
         )
     )
     assert_allclose(many.rotation, seen.rotation, rtol=0.2)
@@ -86,7 +97,8 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
     )
     hidden = DofObservability("yaw", DofVerdict.UNOBSERVABLE, np.inf)
     hiding = dataclasses.replace(
-        result, observability_measured=(*result.observability_measured[:5], hidden)
+        result,
+        observability_measured=(*result.observability_measured[:5], hidden),
     )
     assert excitation.what_is_missing(seen_in(poses), hiding) == (
         "the rotation about z cannot be determined from the motion so far: rotations about y help "
@@ -104,7 +116,9 @@ def test_an_arm_is_not_told_to_drive():
         "z cannot be determined from the motion so far: tilt the sensors about x and y, or measure "
         "it by hand"
     )
-    assert excitation.helpful_motion(["x"], seen) == "rotations about y help most"
+    assert (
+        excitation.helpful_motion(["x"], seen) == "rotations about y help most"
+    )
     still = seen_in(
         se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path)
     )
@@ -133,7 +147,9 @@ def test_a_vehicle_is_told_to_drive_over_a_ramp():
 
 
 def chords(rotation_vectors):
-    return se3.rotation_exp(np.asarray(rotation_vectors, dtype=float)) - np.eye(3)
+    return se3.rotation_exp(np.asarray(rotation_vectors, dtype=float)) - np.eye(
+        3
+    )
 
 
 def about_z_and_x(share, n=200):
@@ -144,7 +160,10 @@ def about_z_and_x(share, n=200):
 
 def test_the_axis_of_all_rotations_is_hidden():
     for share, hidden in ((0.0, ("z",)), (0.02, ("z",)), (0.3, ())):
-        assert hidden_axes(lever_arm_products(chords(about_z_and_x(share)))) == hidden
+        assert (
+            hidden_axes(lever_arm_products(chords(about_z_and_x(share))))
+            == hidden
+        )
 
 
 @pytest.mark.parametrize(
@@ -154,15 +173,17 @@ def test_verdict_finding_and_hint_agree(pitch_rad, hidden):
     n = 600
     yaw = np.cumsum(np.random.default_rng(3).normal(0, 0.08, n))
     pitch = pitch_rad * np.sin(np.arange(n) * 0.15)
-    rotation = se3.rotation_exp(np.c_[0 * yaw, 0 * yaw, yaw]) @ se3.rotation_exp(
-        np.c_[0 * yaw, pitch, 0 * yaw]
-    )
+    rotation = se3.rotation_exp(
+        np.c_[0 * yaw, 0 * yaw, yaw]
+    ) @ se3.rotation_exp(np.c_[0 * yaw, pitch, 0 * yaw])
     position = np.cumsum(0.1 * np.c_[np.cos(yaw), np.sin(yaw), 0 * yaw], axis=0)
     poses = se3.from_rotation_translation(rotation, position)
     parent, child = noisy_pair(poses, 1, 1e-4, 1e-5)
     result = calibrate(parent, child, reference="B10")
     codes = codes_of(check_streams(parent, child).findings)
-    seen = excitation.excitation(PosePairs(parent.stamps_ns, parent.poses, child.poses))
+    seen = excitation.excitation(
+        PosePairs(parent.stamps_ns, parent.poses, child.poses)
+    )
     assert ("z" in result.unobservable()) is hidden
     assert ("one_axis" in codes) is hidden
     assert ("z" in seen.hidden_axes()) is hidden

@@ -49,7 +49,9 @@ def bag_of(path, parent, child, storage="mcap"):
             if kind == TF:
                 make = tf_message([(stamp_ns, world, sensor, pose)])
             else:
-                make = pose_message(kind, stamp_ns, se3.to_rows(pose), world, sensor)
+                make = pose_message(
+                    kind, stamp_ns, se3.to_rows(pose), world, sensor
+                )
             recorded.append((stamp_ns, topic, kind, make))
     return write_messages(path, recorded, storage)
 
@@ -72,19 +74,33 @@ def frames_of(document):
 @pytest.mark.parametrize(
     ("world", "sensor", "expected"),
     [
-        ("camera", "aruco_marker", "camera"),  # a camera that sees a fixed marker
-        ("camera_color_optical_frame", "tag36h11:3", "camera_color_optical_frame"),
+        (
+            "camera",
+            "aruco_marker",
+            "camera",
+        ),  # a camera that sees a fixed marker
+        (
+            "camera_color_optical_frame",
+            "tag36h11:3",
+            "camera_color_optical_frame",
+        ),
         ("camera", "", "camera"),  # a PoseStamped of the marker
         ("base_link", "tool0", "base_link"),  # an arm, seen from its hand
         ("tool0", "base_link", "tool0"),
-        ("odom", "base_link", "base_link"),  # a publisher that writes inverse poses
+        (
+            "odom",
+            "base_link",
+            "base_link",
+        ),  # a publisher that writes inverse poses
         ("camera_init", "aft_mapped", "aft_mapped"),
         ("t265_odom_frame", "t265_pose_frame", "t265_pose_frame"),
         ("vicon/world", "target", "vicon/world"),
         ("", "lidar", "lidar"),
     ],
 )
-def test_inverse_poses_are_those_of_the_frame_that_is_no_world(world, sensor, expected):
+def test_inverse_poses_are_those_of_the_frame_that_is_no_world(
+    world, sensor, expected
+):
     frames = StreamFrames(sensor, world)
     assert frames.inverse_name == expected
 
@@ -121,7 +137,9 @@ def test_a_camera_that_observes_a_fixed_marker_is_the_child(
     ]
     document, _ = calibrated(capsys, path, *options)
     assert frames_of(document) == ("tool0", "camera")
-    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
     beginning = "the child sensor is now camera, because"
     assert [text for text in document["warnings"] if text.startswith(beginning)]
 
@@ -131,7 +149,13 @@ def test_the_repair_that_inverts_a_stream_names_the_result_and_its_files_by_the_
 ):
     rows = np.random.default_rng(4).normal(scale=2e-3, size=(2, N, 6))
     parent = ("/tf", TF, "base_link", "tool0", POSES @ se3.exp(rows[0]))
-    child = ("/tf", TF, "camera", "aruco_marker", se3.inverse(CHILD @ se3.exp(rows[1])))
+    child = (
+        "/tf",
+        TF,
+        "camera",
+        "aruco_marker",
+        se3.inverse(CHILD @ se3.exp(rows[1])),
+    )
     path = bag_of(tmp_path / "bag", parent, child)
     sources = [
         "--parent-topic",
@@ -151,7 +175,8 @@ def test_the_repair_that_inverts_a_stream_names_the_result_and_its_files_by_the_
     assert frames_of(saved) == ("tool0", "camera")
     result = hec.load(out)
     assert (
-        "--frame-id tool0 --child-frame-id camera" in result.static_transform_command()
+        "--frame-id tool0 --child-frame-id camera"
+        in result.static_transform_command()
     )
     urdf = (out / "extrinsic.urdf.xacro").read_text()
     assert "aruco" not in urdf
@@ -164,7 +189,11 @@ def test_a_camera_beside_an_arm_that_sees_a_marker_on_the_hand_is_named_by_both_
     arm = Trajectory(STAMPS_NS, POSES, "tool0", "base_link")
     marker = Trajectory(STAMPS_NS, CHILD, "aruco_marker", "camera")
     options = {"reference": "B5", "checks": False}
-    inverse_options = {"parent_invert": "poses", "child_invert": "poses", **options}
+    inverse_options = {
+        "parent_invert": "poses",
+        "child_invert": "poses",
+        **options,
+    }
     T_base_camera = POSES[0] @ T_PARENT_CHILD @ se3.inverse(CHILD[0])
 
     as_it_is = hec.calibrate(arm, marker, **options)
@@ -220,7 +249,12 @@ def test_frames_given_the_other_way_round_choose_the_topics(tmp_path, capsys):
     assert frames_of(document) == ("camera", "lidar")
     inverse = se3.inverse(T_PARENT_CHILD)
     assert_allclose(document["T_parent_child"]["matrix"], inverse, atol=1e-6)
-    topics = ["--parent-topic", "/lidar/odometry", "--child-topic", "/camera/odometry"]
+    topics = [
+        "--parent-topic",
+        "/lidar/odometry",
+        "--child-topic",
+        "/camera/odometry",
+    ]
     assert main(["calibrate", str(path), *topics, *names]) == 1
     error = capsys.readouterr().err
     assert (
@@ -237,19 +271,26 @@ def test_a_name_of_the_other_stream_is_refused_everywhere():
         {"parent_frame": "camera", "child_frame": "front"},
         {"child_frame": "/lidar", "parent_frame": "roof"},
     ):
-        with pytest.raises(InputError, match="that is the frame of the other stream"):
+        with pytest.raises(
+            InputError, match="that is the frame of the other stream"
+        ):
             hec.calibrate(lidar, camera, checks=False, **names)
         live = Calibrator(CalibratorConfig(**names))
         live.set_frame("parent", "lidar")
         live.set_frame("child", "camera")
-        with pytest.raises(InputError, match="that is the frame of the other stream"):
+        with pytest.raises(
+            InputError, match="that is the frame of the other stream"
+        ):
             live.estimate()
 
 
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
-        ({"parent_frame": "lidar", "child_frame": "camera"}, ("lidar", "camera")),
+        (
+            {"parent_frame": "lidar", "child_frame": "camera"},
+            ("lidar", "camera"),
+        ),
         ({"parent_frame": "roof", "child_frame": "front"}, ("roof", "front")),
         ({"child_frame": "front"}, ("lidar", "front")),
         ({}, ("lidar", "camera")),
@@ -332,8 +373,13 @@ def test_a_topic_whose_messages_name_another_frame_is_not_taken(tmp_path):
     second = ("/b", POSE_STAMPED, "odom", "", CHILD)
     path = bag_of(tmp_path / "bag", first, second)
     with PoseBag(path) as bag:
-        assert bag.select(frames={"parent": "camera", "child": ""}) == ("/b", "/a")
-        assert bag.select(frames={"parent": "base_link", "child": "camera"}) == (
+        assert bag.select(frames={"parent": "camera", "child": ""}) == (
+            "/b",
+            "/a",
+        )
+        assert bag.select(
+            frames={"parent": "base_link", "child": "camera"}
+        ) == (
             "/a",
             "/b",
         )
@@ -379,7 +425,9 @@ def test_frames_of_ros1_lose_their_slash_wherever_they_are_printed(
 def test_options_trees_results_and_installed_poses_have_no_slash(tmp_path):
     config = CalibratorConfig(parent_frame="/base_link", child_frame="/camera")
     assert (config.parent_frame, config.child_frame) == ("base_link", "camera")
-    assert NodeConfig(base_frame="/base_footprint").base_frame == "base_footprint"
+    assert (
+        NodeConfig(base_frame="/base_footprint").base_frame == "base_footprint"
+    )
     tree = FrameTree()
     tree.add("/base_link", "/camera", T_PARENT_CHILD)
     assert_array_equal(tree.pose("base_link", "camera"), T_PARENT_CHILD)

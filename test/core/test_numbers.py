@@ -46,14 +46,17 @@ def test_a_weight_is_the_slope_of_its_loss_over_the_residual(kind, loss):
     lengths = np.array([0.1, 0.5, 0.9, 1.1, 3.0, 20.0])
     step = 1e-6
     slopes = [
-        (loss(length + step) - loss(length - step)) / (2 * step) for length in lengths
+        (loss(length + step) - loss(length - step)) / (2 * step)
+        for length in lengths
     ]
     assert stats.robust_weights(kind, lengths**2) == pytest.approx(
         slopes / lengths, rel=1e-6
     )
 
 
-@pytest.mark.parametrize(("kind", "within"), [("huber", 1e-3), ("cauchy", 1e-3)])
+@pytest.mark.parametrize(
+    ("kind", "within"), [("huber", 1e-3), ("cauchy", 1e-3)]
+)
 def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
     random = np.random.default_rng(1)
     rows = random.normal(size=(200, 3, 2))
@@ -62,7 +65,9 @@ def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
     targets = rows @ true_slopes + noise
     targets[:40] += 5.0
 
-    plain, *_ = np.linalg.lstsq(rows.reshape(-1, 2), targets.ravel(), rcond=None)
+    plain, *_ = np.linalg.lstsq(
+        rows.reshape(-1, 2), targets.ravel(), rcond=None
+    )
     slopes, lengths = stats.robust_regression(kind, rows, targets, 20, median)
 
     largest_error = np.abs(plain - true_slopes).max()
@@ -75,7 +80,9 @@ def test_a_fifth_of_wrong_rows_hardly_changes_a_robust_regression(kind, within):
 def test_a_robust_regression_without_evidence_for_a_value_leaves_it_zero():
     rows = np.array([[[1.0, 0.0]], [[2.0, 0.0]]])
     targets = np.array([[3.0], [6.0]])
-    slopes, lengths = stats.robust_regression("cauchy", rows, targets, 3, median)
+    slopes, lengths = stats.robust_regression(
+        "cauchy", rows, targets, 3, median
+    )
     assert slopes == pytest.approx([3.0, 0.0])
     assert lengths == pytest.approx([0.0, 0.0], abs=1e-12)
 

@@ -60,7 +60,13 @@ VALUES = {
 # Options that a kind of streams refuses: of wheels, of methods of the paper, of lengths, of
 # orientations.
 _OF_WHEELS = {"nominal_radius", "nominal_separation"}
-_OF_WHOLE_POSES = {"method", "reference", "backend", "threshold", "min_inlier_fraction"}
+_OF_WHOLE_POSES = {
+    "method",
+    "reference",
+    "backend",
+    "threshold",
+    "min_inlier_fraction",
+}
 REFUSED = {
     "poses": set(),
     "positions": {"parent_measures", "child_invert", "child_quaternion"}
@@ -69,11 +75,19 @@ REFUSED = {
     "rates": {"scale", "parent_scale", "child_invert", "child_quaternion"}
     | _OF_WHOLE_POSES,
     "stops": {"max_pairs", "max_gap", "time_offset"}
-    | {"keyframe.min_translation", "keyframe.min_rotation", "keyframe.min_interval"}
+    | {
+        "keyframe.min_translation",
+        "keyframe.min_rotation",
+        "keyframe.min_interval",
+    }
     | {"parent_kind", "child_kind"}
     | _OF_WHOLE_POSES,
     "rig": {"time_offset", "scale"}
-    | {name for name in VALUES if name.startswith(("parent_", "child_", "prior."))},
+    | {
+        name
+        for name in VALUES
+        if name.startswith(("parent_", "child_", "prior."))
+    },
     "together": set(),
 }
 
@@ -122,7 +136,9 @@ def stops():
 def sensors():
     """Noisy streams of three sensors of a rig."""
     parent, child = streams("poses")
-    other = child_of(wandering_poses(240)) @ se3.exp(np.array([0.2, 0.1, 0, 0, 0, 0.3]))
+    other = child_of(wandering_poses(240)) @ se3.exp(
+        np.array([0.2, 0.1, 0, 0, 0, 0.3])
+    )
     return {
         "lidar": parent,
         "camera": child,
@@ -148,7 +164,9 @@ def joint_result(options):
 def document(kind, **options):
     try:
         if kind == "stops":
-            result = calibrate_stops(*stops(), CalibratorConfig.from_options(options))
+            result = calibrate_stops(
+                *stops(), CalibratorConfig.from_options(options)
+            )
         elif kind == "rig":
             result = calibrate_rig(sensors(), options)
         elif kind == "together":

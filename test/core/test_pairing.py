@@ -1,6 +1,12 @@
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, walked, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    walked,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -38,7 +44,8 @@ def test_references_are_those_of_the_paper(reference, n_poses, expected):
 
 
 @pytest.mark.parametrize(
-    "reference", ["", "D", "B0", "B", "C1", "B-1", "b1", "A1", "B01", "auto", "B1 "]
+    "reference",
+    ["", "D", "B0", "B", "C1", "B-1", "b1", "A1", "B01", "auto", "B1 "],
 )
 def test_anything_else_is_not_a_reference(reference):
     poses = wandering_poses(10)

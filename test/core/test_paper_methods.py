@@ -22,7 +22,10 @@ TRUTH = se3.exp(np.array([0.4, -0.2, 0.7, 0.9, -0.5, 1.1]))
 def pairs_of(Ts_parenti_parentj, Ts_childi_childj):
     index = np.arange(len(Ts_parenti_parentj))
     return MotionPairs(
-        np.asarray(Ts_parenti_parentj), np.asarray(Ts_childi_childj), index, index + 1
+        np.asarray(Ts_parenti_parentj),
+        np.asarray(Ts_childi_childj),
+        index,
+        index + 1,
     )
 
 
@@ -43,7 +46,9 @@ def split(T):
 
 def squared_translation_residual(pairs, rotation, translation):
     total = 0.0
-    for A, B in zip(pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True):
+    for A, B in zip(
+        pairs.Ts_parenti_parentj, pairs.Ts_childi_childj, strict=True
+    ):
         R_A, t_A = split(A)
         _, t_B = split(B)
         residual = R_A @ translation + t_A - rotation @ t_B - translation
@@ -171,7 +176,8 @@ def test_ali_minimises_the_translation_residual_over_rotations(noisy):
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     random = np.random.default_rng(1)
     minima = [
-        minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun for _ in range(5)
+        minimize(cost, random.uniform(-1.5, 1.5, 6), tol=1e-12).fun
+        for _ in range(5)
     ]
     assert solution.objective <= min(minima) * (1 + 1e-9)
     assert solution.objective == pytest.approx(min(minima), rel=1e-6)
@@ -192,5 +198,6 @@ def test_ali_is_blind_to_the_rotation_of_the_child(noisy):
 
 def test_ali_as_published_fits_a_matrix_that_is_no_rotation(noisy):
     assert (
-        ali_as_published.solve(noisy).objective > all_pairs.solve_ali(noisy).objective
+        ali_as_published.solve(noisy).objective
+        > all_pairs.solve_ali(noisy).objective
     )

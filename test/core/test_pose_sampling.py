@@ -12,7 +12,9 @@ from reproduction.platforms import PLATFORMS
 from reproduction.pose_faults import FAULTS, clean, computed, faulty
 
 OF_ONE_STREAM = [
-    fault for fault, (_, codes) in FAULTS.items() if "not_independent" not in codes
+    fault
+    for fault, (_, codes) in FAULTS.items()
+    if "not_independent" not in codes
 ]
 
 

@@ -9,7 +9,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import prior_as_typed
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.results.calibration import (
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
 from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.offline.calibrate import calibrate
 from hand_eye_calib.offline.cli.main import main
@@ -39,7 +43,11 @@ class TestOption:
             ("prior.z", "185cm +/- 20mm", {"z": (1.85, 0.02)}),
             ("prior.z", "1.85+-0.02", {"z": (1.85, 0.02)}),
             ("prior.x", "-.5±1e-2", {"x": (-0.5, 0.01)}),
-            ("prior.yaw", "-90deg+/-2deg", {"yaw": (-np.pi / 2, np.radians(2))}),
+            (
+                "prior.yaw",
+                "-90deg+/-2deg",
+                {"yaw": (-np.pi / 2, np.radians(2))},
+            ),
             ("prior.roll", "0.1+/-0.05", {"roll": (0.1, 0.05)}),
             ("prior.z", "8m+/-0.02", {"z": (8.0, 0.02)}),
             ("prior.z", "800cm+/-2cm", {"z": (8.0, 0.02)}),
@@ -70,7 +78,11 @@ class TestOption:
             ("prior_x", "1+/-1e200", r"at most 1e\+06 m; got '1e200'"),
             ("prior_yaw", "1+/-1e999", r"at most 1e\+06 rad; got '1e999'"),
             ("prior_z", "-22+/-2", r"write -22cm\+/-2cm or -22m\+/-2m"),
-            ("prior_x", "5.1+/-0.02", r"write 5.1cm\+/-0.02cm or 5.1m\+/-0.02m"),
+            (
+                "prior_x",
+                "5.1+/-0.02",
+                r"write 5.1cm\+/-0.02cm or 5.1m\+/-0.02m",
+            ),
             ("prior_y", "220.0+/-20.0", "may be m, cm or mm"),
             ("prior_z", "8+/-2cm", r"write 8cm\+/-2cm or 8m\+/-2cm"),
             (
@@ -115,7 +127,9 @@ class TestFlatGround:
         assert_allclose(vague.allowance, plain.allowance, rtol=1e-3)
 
     def test_prior_fills_in_what_is_unknown(self):
-        result = calibrate(*flat_drive(), reference="B10", prior={"z": (1.85, 0.02)})
+        result = calibrate(
+            *flat_drive(), reference="B10", prior={"z": (1.85, 0.02)}
+        )
         assert result.status is SolveStatus.OK
         assert result.unobservable() == []
         assert_allclose(result.T_parent_child[:3, 3], MOUNT[:3, 3], atol=0.03)
@@ -187,9 +201,14 @@ class TestFullMotion:
         assert result.status.failure == "a prior contradicts the motion"
         assert result.verdict is Verdict.DO_NOT_USE
         assert result.reasons[0].sentence.startswith(f"the prior on {axis} is ")
-        assert result.reasons[0].advice == f"check value, unit and sign of prior.{axis}"
+        assert (
+            result.reasons[0].advice
+            == f"check value, unit and sign of prior.{axis}"
+        )
         assert_array_equal(result.T_parent_child, plain.T_parent_child)
-        assert_array_equal(result.covariance_measured, plain.covariance_measured)
+        assert_array_equal(
+            result.covariance_measured, plain.covariance_measured
+        )
 
 
 @pytest.mark.parametrize("interface", ["Python", "command", "YAML", "page"])
@@ -216,13 +235,16 @@ def test_centimetres_that_were_typed_without_a_unit_are_asked_about(
         file.write_text("prior.z: -22+/-2\n", encoding="utf-8")
         options = ["--config", str(file)]
     try:
-        status = main(["calibrate", *paths, *options, "--out", str(tmp_path / "out")])
+        status = main(
+            ["calibrate", *paths, *options, "--out", str(tmp_path / "out")]
+        )
     except SystemExit as usage:
         status = usage.code
     assert status == 2
     error = capsys.readouterr().err
     assert (
-        "needs a unit: -22 may be m, cm or mm; write -22cm+/-2cm or -22m+/-2m" in error
+        "needs a unit: -22 may be m, cm or mm; write -22cm+/-2cm or -22m+/-2m"
+        in error
     )
     assert not (tmp_path / "out").exists()
 
@@ -234,7 +256,9 @@ def test_along_an_unobservable_axis_only_an_impossible_distance_contradicts():
     in_millimetres = {"z": "1850m+/-20m"}
 
     result = calibrate(parent, child, reference="B10", prior=boom)
-    contradicted = calibrate(parent, child, reference="B10", prior=in_millimetres)
+    contradicted = calibrate(
+        parent, child, reference="B10", prior=in_millimetres
+    )
 
     assert result.status is SolveStatus.OK
     assert result.T_parent_child[2, 3] == pytest.approx(15.0, abs=0.05)

@@ -57,7 +57,9 @@ def errors(result, drive):
 
 def loss_of_inverse(parent, child):
     upright = parent.poses, child.poses
-    return loss_difference(parent.stamps_ns, upright, tuple(map(se3.inverse, upright)))
+    return loss_difference(
+        parent.stamps_ns, upright, tuple(map(se3.inverse, upright))
+    )
 
 
 class TestNoise:
@@ -67,7 +69,9 @@ class TestNoise:
         assert right > 100.0
         assert wrong == pytest.approx(-right, rel=1e-3)
 
-    def test_a_camera_that_sees_a_target_is_as_likely_as_inverse_poses(self, arm):
+    def test_a_camera_that_sees_a_target_is_as_likely_as_inverse_poses(
+        self, arm
+    ):
         assert abs(loss_of_inverse(arm.parent, arm.child)) < 20.0
 
     def test_jumps_in_one_reading_do_not_decide(self, hand):
@@ -103,7 +107,10 @@ class TestDecision:
         self, difference, shape, paths, is_small, index
     ):
         readings = Readings(
-            hypotheses=(PLAIN, INVERSE), shape=shape, paths=paths, is_small=is_small
+            hypotheses=(PLAIN, INVERSE),
+            shape=shape,
+            paths=paths,
+            is_small=is_small,
         )
         assert decide(readings, difference) == index
 
@@ -116,17 +123,27 @@ class TestDecision:
             (500.0, -0.1, 0),
         ],
     )
-    def test_a_clear_shape_decides_about_late_stamps(self, difference, shape, index):
+    def test_a_clear_shape_decides_about_late_stamps(
+        self, difference, shape, index
+    ):
         readings = Readings(
-            hypotheses=(PLAIN, INVERSE), shape=shape, paths=shape, is_small=False
+            hypotheses=(PLAIN, INVERSE),
+            shape=shape,
+            paths=shape,
+            is_small=False,
         )
         assert decide(readings, difference, has_late_stamps=True) == index
 
-    def test_of_two_inverted_readings_the_shape_decides_in_a_small_space_too(self):
+    def test_of_two_inverted_readings_the_shape_decides_in_a_small_space_too(
+        self,
+    ):
         of_child = Hypothesis((), ("inverse",))
         of_parent = Hypothesis(("inverse",), ())
         readings = Readings(
-            hypotheses=(of_child, of_parent), shape=0.6, paths=0.1, is_small=True
+            hypotheses=(of_child, of_parent),
+            shape=0.6,
+            paths=0.1,
+            is_small=True,
         )
         assert decide(readings, 0.0) == 1
         assert decide(replace(readings, shape=-0.6), 0.0) == 0
@@ -146,7 +163,9 @@ class TestInverse:
         metres, degrees = errors(result, hand)
         assert metres < 0.05
         assert degrees < 0.5
-        (text,) = (text for text in result.warnings if text.startswith("repaired"))
+        (text,) = (
+            text for text in result.warnings if text.startswith("repaired")
+        )
         assert 'parent_invert="poses", child_invert="poses"' in text
         assert result.verdict is not hec.Verdict.DO_NOT_USE
 
@@ -170,7 +189,9 @@ class TestInverse:
         assert result.scale == pytest.approx(2.0, rel=0.02)
 
     def test_the_node_repairs_as_the_command_does(self, hand):
-        snapshot = whole_snapshot(inverted(hand.parent), inverted(hand.child), {})
+        snapshot = whole_snapshot(
+            inverted(hand.parent), inverted(hand.child), {}
+        )
         run = review(snapshot.estimate(), snapshot)
         assert {name: run.options[name] for name in BOTH} == BOTH
         assert errors(run.calibration, hand)[0] < 0.05
@@ -180,7 +201,9 @@ class TestUnclear:
     def test_both_answers_are_shown_and_none_is_to_be_used(self, arm):
         result = hec.calibrate(inverted(arm.parent), inverted(arm.child))
         assert result.verdict is hec.Verdict.DO_NOT_USE
-        (finding,) = (finding for finding in result.findings if finding.makes_unusable)
+        (finding,) = (
+            finding for finding in result.findings if finding.makes_unusable
+        )
         assert finding.code == "inverse_both"
         answers = re.findall(r"x (\S+), y (\S+), z (\S+) m", finding.what)
         places = [[float(number) for number in answer] for answer in answers]
@@ -190,7 +213,9 @@ class TestUnclear:
 
     @pytest.mark.parametrize("options", [NONE, BOTH])
     def test_an_option_decides(self, arm, options):
-        result = hec.calibrate(inverted(arm.parent), inverted(arm.child), **options)
+        result = hec.calibrate(
+            inverted(arm.parent), inverted(arm.child), **options
+        )
         assert not any(finding.makes_unusable for finding in result.findings)
         is_right = errors(result, arm)[0] < 0.05
         assert is_right == (options == BOTH)
@@ -242,7 +267,8 @@ class TestStrangers:
         child = read_trajectory(folder / "kinhec_noise0_camera.tum")
         result = hec.calibrate(parent, child)
         expected = se3.from_quat_xyzw(
-            (0.05422, -0.04398, 0.02275), (-0.082082, 0.121445, 0.972309, 0.182015)
+            (0.05422, -0.04398, 0.02275),
+            (-0.082082, 0.121445, 0.972309, 0.182015),
         )
         error = np.abs(deviation(result.T_parent_child, expected))
         assert error[:3].max() < 0.001
@@ -251,7 +277,9 @@ class TestStrangers:
     def test_a_flight_of_inverse_poses_is_repaired(self):
         folder = data_folder() / "strangers"
         with pytest.warns(UserWarning, match="sorted|stamps"):
-            parent = read_trajectory(folder / "falcon5_imu_odom.csv", repair=True)
+            parent = read_trajectory(
+                folder / "falcon5_imu_odom.csv", repair=True
+            )
         child = read_trajectory(folder / "falcon5_vicon.csv", repair=True)
         result = hec.calibrate(parent, child, time_offset="estimate")
         expected = [-0.007, -0.034, -0.055]
@@ -267,11 +295,23 @@ def test_the_inversions_are_options_of_the_engine():
 @pytest.mark.parametrize(
     ("mount", "worlds", "counts"),
     [
-        ([0.2, 0.0, 0.0, 0.0, 0.0, 0.5], [3.0, -2.0, 1.0, 0.5, 0.2, -2.0], True),
-        ([0.2, 0.0, 0.0, 0.0, 0.0, 0.05], [3.0, -2.0, 1.0, 0.5, 0.2, -2.0], False),
+        (
+            [0.2, 0.0, 0.0, 0.0, 0.0, 0.5],
+            [3.0, -2.0, 1.0, 0.5, 0.2, -2.0],
+            True,
+        ),
+        (
+            [0.2, 0.0, 0.0, 0.0, 0.0, 0.05],
+            [3.0, -2.0, 1.0, 0.5, 0.2, -2.0],
+            False,
+        ),
         ([2.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.1, 0.1, 0.0, 0.0, 0.0, 0.5], True),
         # Drift turns the world of one stream against the same world of the other.
-        ([2.0, 0.0, 0.0, 0.0, 0.0, 0.5], [0.1, 0.1, 0.0, 0.0, 0.0, 0.05], False),
+        (
+            [2.0, 0.0, 0.0, 0.0, 0.0, 0.5],
+            [0.1, 0.1, 0.0, 0.0, 0.0, 0.05],
+            False,
+        ),
         ([2.0, 0.0, 0.0, 0.0, 0.0, 0.05], [0.1, 0.1, 0.0, 0.0, 0.0, 0.5], True),
     ],
 )
@@ -279,7 +319,9 @@ def test_nearly_the_same_frames_are_no_evidence_about_inverse_poses(
     mount, worlds, counts
 ):
     Ts_pw_p = wandering_poses(200)
-    child = child_of(Ts_pw_p, *(se3.exp(np.array(twist)) for twist in (mount, worlds)))
+    child = child_of(
+        Ts_pw_p, *(se3.exp(np.array(twist)) for twist in (mount, worlds))
+    )
     streams = StreamPair(as_trajectory(Ts_pw_p), as_trajectory(child), 1.0)
     explanation = hypotheses.explain(streams, thorough=False)
     _, arms = shape.evidence_for_inverse(streams, explanation.fit)

@@ -71,7 +71,9 @@ class TestSolver:
         values = []
         for seed in range(30):
             solution = solve(motion_pairs(*noisy_poses(seed), reference))
-            values.append(nees(error_of(solution), solution.cov_parent_child_in_child))
+            values.append(
+                nees(error_of(solution), solution.cov_parent_child_in_child)
+            )
         # Six degrees of freedom; few independent motions widen the distribution.
         assert_nees(values, 4.0, 11.0)
 
@@ -124,7 +126,8 @@ class TestSecondOpinions:
         step = np.zeros(6)
         step[axis] = 0.1
         far = replace(
-            answer, T_parent_child=shifted_in_parent(answer.T_parent_child, step)
+            answer,
+            T_parent_child=shifted_in_parent(answer.T_parent_child, step),
         )
         expected = np.zeros(6)
         expected[axis] = 0.1
@@ -137,7 +140,8 @@ class TestSecondOpinions:
             answer,
             T_parent_child=T_far,
             observability=tuple(
-                replace(dof, sigma=0.1 * dof.sigma) for dof in answer.observability
+                replace(dof, sigma=0.1 * dof.sigma)
+                for dof in answer.observability
             ),
         )
         assert added_sigmas(certain, opinions).max() == 0.0

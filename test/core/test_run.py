@@ -48,7 +48,9 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
     assert result.time_offset_sigma_s > 0
     assert_allclose(result.T_parent_child, expected, atol=0.02)
     (warning,) = (
-        text for text in result.warnings if 'solved with time_offset="estimate"' in text
+        text
+        for text in result.warnings
+        if 'solved with time_offset="estimate"' in text
     )
     assert "the child's clock is 0.3" in warning
 
@@ -73,11 +75,16 @@ def test_an_axis_with_a_prior_is_not_called_unknown():
     child = as_trajectory(disturbed(child_of(parent.poses), 1, 0.002, 0.001))
     (without,) = hec.calibrate(parent, child).findings
     assert (
-        "z cannot be determined from this motion, and will be unknown" in without.what
+        "z cannot be determined from this motion, and will be unknown"
+        in without.what
     )
-    (with_prior,) = hec.calibrate(parent, child, prior={"z": (0.1, 0.02)}).findings
+    (with_prior,) = hec.calibrate(
+        parent, child, prior={"z": (0.1, 0.02)}
+    ).findings
     assert with_prior.code == "one_axis"
-    assert with_prior.what.endswith("motion: the prior alone determines the value")
+    assert with_prior.what.endswith(
+        "motion: the prior alone determines the value"
+    )
     assert not with_prior.options
 
 
@@ -131,7 +138,11 @@ def written_otherwise(trajectory, convention):
     return replace(trajectory, poses=poses)
 
 
-REPAIRS = [{"invert": "poses"}, {"invert": "orientations"}, {"quaternion": "wxyz"}]
+REPAIRS = [
+    {"invert": "poses"},
+    {"invert": "orientations"},
+    {"quaternion": "wxyz"},
+]
 REPAIRS += [{"quaternion": "wxyz", "invert": "poses"}, {"quaternion": "yzwx"}]
 
 
@@ -156,12 +167,12 @@ def test_a_stream_in_another_convention_is_repaired_and_that_is_said(
 
     assert_allclose(result.T_parent_child, expected, atol=1e-9)
     assert result.verdict is Verdict.USE
-    (warning,) = (text for text in result.warnings if text.startswith("repaired: "))
+    (warning,) = (
+        text for text in result.warnings if text.startswith("repaired: ")
+    )
     solved = as_options(repairs)
     undo = as_options(defaults)
-    sentence = (
-        f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
-    )
+    sentence = f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
     assert sentence in warning
 
 
@@ -179,7 +190,9 @@ def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
     assert "as the streams are: no result" in "\n".join(result.warnings)
 
 
-def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(streams):
+def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(
+    streams,
+):
     parent, child, _expected = streams
     as_it_is = hec.calibrate(
         parent, written_otherwise(child, REPAIRS[0]), child_invert="none"
@@ -191,7 +204,9 @@ def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(stre
         as_it_is.verdict,
         {"child_invert": "none"},
     )
-    unit = hec.calibrate(parent, child.scaled(1000.0), reference="B5", scale="none")
+    unit = hec.calibrate(
+        parent, child.scaled(1000.0), reference="B5", scale="none"
+    )
     assert (unit.scale, unit.verdict) == (1.0, as_it_is.verdict)
     assert unit.reasons[0].options == {"scale": 0.001}
 
@@ -209,7 +224,9 @@ def test_kept_pairs_are_put_right_like_poses(streams):
     )
 
     repaired = with_options(kept, {"child_invert": "poses"})
-    with_offset = with_options(kept, {"child_invert": "poses", "time_offset": 0.0})
+    with_offset = with_options(
+        kept, {"child_invert": "poses", "time_offset": 0.0}
+    )
 
     assert_allclose(repaired.estimate().T_parent_child, expected, atol=1e-9)
     assert_allclose(with_offset.estimate().T_parent_child, expected, atol=1e-9)
@@ -254,7 +271,8 @@ def test_options_that_are_passed_are_given_even_if_they_are_the_defaults():
     config = CalibratorConfig.from_options({"time_offset": 0.0, "prior.z": ""})
     assert config.given == {"time_offset", "prior_z"}
     assert (
-        replace(config, scale="estimate", time_offset="estimate").given == config.given
+        replace(config, scale="estimate", time_offset="estimate").given
+        == config.given
     )
     assert pickle.loads(pickle.dumps(config)).given == config.given
     assert config.is_known("time_offset")
@@ -267,7 +285,10 @@ def test_good_streams_are_left_alone(streams):
     plain = snapshot.estimate()
     outcome = review(plain, snapshot)
     assert outcome.snapshot is snapshot
-    assert (outcome.calibration.warnings, outcome.options) == (plain.warnings, {})
+    assert (outcome.calibration.warnings, outcome.options) == (
+        plain.warnings,
+        {},
+    )
     assert outcome.calibration.findings == ()
 
 
@@ -317,7 +338,9 @@ def test_a_given_reference_solves_nothing_else_unless_cross_checks_are_asked_for
         "hand_eye_calib.core.engine.run.check",
         lambda *_: solved.append("check") or CheckResult(()),
     )
-    result = hec.calibrate(parent, child, method="dnlo", reference="B5", checks=checks)
+    result = hec.calibrate(
+        parent, child, method="dnlo", reference="B5", checks=checks
+    )
     assert solved == ([] if checks is False else ["check"])
     assert (result.cross_check is not None) == (checks is True)
 
@@ -410,10 +433,14 @@ def test_a_model_that_fits_does_not_rule_out_smoothing_without_a_delay(
         (0.9, Severity.WARNING, "shorter"),
     ],
 )
-def test_a_scale_that_the_noise_model_finds_unasked_is_stated(factor, severity, words):
+def test_a_scale_that_the_noise_model_finds_unasked_is_stated(
+    factor, severity, words
+):
     poses = wandering_poses(500)
     parent = as_trajectory(disturbed(poses, 4, 0.002, 0.001))
-    child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(factor)
+    child = as_trajectory(disturbed(child_of(poses), 5, 0.002, 0.001)).scaled(
+        factor
+    )
     result = hec.calibrate(parent, child)
     findings = {finding.code: finding for finding in result.findings}
     if severity is None:

@@ -22,7 +22,9 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.offline.calibrate import calibrate
 
 
-def streams(n_poses=400, seed=0, scale=1.0, noise=0.0, poses=motions.wandering_poses):
+def streams(
+    n_poses=400, seed=0, scale=1.0, noise=0.0, poses=motions.wandering_poses
+):
     """Return two streams at 10 Hz. The child's lengths must be multiplied by ``scale``."""
     true_poses = poses(n_poses, seed)
     parent, child = motions.noisy_pair(true_poses, seed + 1, noise, noise)
@@ -34,7 +36,9 @@ def pose_pairs(parent, child):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.3048, 1.0, 3.34, 1000.0])
-@pytest.mark.parametrize("poses", [motions.wandering_poses, motions.planar_poses])
+@pytest.mark.parametrize(
+    "poses", [motions.wandering_poses, motions.planar_poses]
+)
 def test_noise_free_scale_is_exact(scale, poses):
     parent, child = streams(scale=scale, poses=poses)
     pairs = pose_pairs(parent, child)
@@ -68,7 +72,9 @@ def test_standard_deviation_is_of_the_size_of_the_errors():
     assert_errors_over_sigmas(ratios, 0.3, 3.0)
 
 
-@pytest.mark.parametrize("method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"])
+@pytest.mark.parametrize(
+    "method", ["dnlo", "dnl", "park", "taylor", "zhuang", "ali"]
+)
 def test_every_method_takes_it(method):
     options = {
         "method": method,
@@ -173,7 +179,9 @@ def test_a_body_that_rotates_about_one_of_its_sensors():
 
 
 @pytest.mark.statistics
-@pytest.mark.parametrize(("hz", "jitter_s"), [(RATES_HZ, 0.0), ((50.0, 10.0), 0.006)])
+@pytest.mark.parametrize(
+    ("hz", "jitter_s"), [(RATES_HZ, 0.0), ((50.0, 10.0), 0.006)]
+)
 def test_offset_without_bias_and_its_standard_deviation_of_the_size_of_the_errors(
     hz, jitter_s
 ):
@@ -185,7 +193,9 @@ def test_offset_without_bias_and_its_standard_deviation_of_the_size_of_the_error
             .normal(0.0, jitter_s * 1e9, len(child))
             .astype(int)
         )
-        jittered = dataclasses.replace(child, stamps_ns=child.stamps_ns + late_ns)
+        jittered = dataclasses.replace(
+            child, stamps_ns=child.stamps_ns + late_ns
+        )
         offset = estimate_time_offset(parent, jittered)
         ratios.append((offset.seconds - 1.5) / offset.sigma_s)
     assert abs(np.mean(ratios)) < 1.5, "the offset is biased"
@@ -224,7 +234,9 @@ def test_angular_rates_do_not_depend_on_conventions():
 
 class TestWeakEvidenceIsRefused:
     def test_streams_that_have_nothing_to_do_with_each_other(self):
-        refused = "time offset cannot be estimated: .*(correlated by|times better)"
+        refused = (
+            "time offset cannot be estimated: .*(correlated by|times better)"
+        )
         for seed in range(5):
             parent, _ = drive(seed)
             _, child_of_another_drive = drive(seed + 50)
@@ -242,7 +254,9 @@ class TestWeakEvidenceIsRefused:
         parent, child = drive()
         short_parent = parent[:40]
         short_child = child[:60]
-        with pytest.raises(NotEnoughDataError, match="give time_offset in seconds"):
+        with pytest.raises(
+            NotEnoughDataError, match="give time_offset in seconds"
+        ):
             estimate_time_offset(short_parent, short_child)
 
 
@@ -260,7 +274,9 @@ class TestClockRate:
         error_ppm = abs(rate.ppm - 75.0)
         assert error_ppm < 5.0
         assert error_ppm < 5.0 * rate.sigma_ppm
-        assert 'ppm slow: solved with time_offset="estimate"' in result.warnings[0]
+        assert (
+            'ppm slow: solved with time_offset="estimate"' in result.warnings[0]
+        )
         difference = se3.inverse(plain.T_parent_child) @ result.T_parent_child
         sigmas = np.sqrt(np.diag(plain.covariance_measured))
         ratios = np.abs(se3.log(difference)) / sigmas
@@ -283,7 +299,9 @@ class TestInTheEngine:
         assert 0 < estimated.time_offset_sigma_s < 0.002
         again = type(estimated).from_dict(estimated.to_dict())
         assert again.time_offset_sigma_s == estimated.time_offset_sigma_s
-        fixed = calibrate(parent, child, time_offset=estimated.time_offset_s, **options)
+        fixed = calibrate(
+            parent, child, time_offset=estimated.time_offset_s, **options
+        )
         assert_array_equal(fixed.T_parent_child, estimated.T_parent_child)
         assert fixed.time_offset_sigma_s == 0.0
         assert (
@@ -301,14 +319,18 @@ class TestInTheEngine:
         )
         for eighth in range(8):
             for stream, trajectory in (("parent", parent), ("child", child)):
-                first, last = (k * len(trajectory) // 8 for k in (eighth, eighth + 1))
+                first, last = (
+                    k * len(trajectory) // 8 for k in (eighth, eighth + 1)
+                )
                 motions.feed(calibrator, stream, trajectory[first:last])
         snapshot = calibrator.snapshot()
         assert len(snapshot.kept) > 0
         assert snapshot.time_offset.seconds == pytest.approx(0.2, abs=0.002)
         result = snapshot.estimate()
         assert result.time_offset_s == snapshot.time_offset.seconds
-        assert_allclose(result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02)
+        assert_allclose(
+            result.T_parent_child, motions.T_PARENT_CHILD, atol=0.02
+        )
 
     def test_streams_that_cannot_be_aligned_do_not_fill_the_memory(self):
         calibrator = Calibrator(

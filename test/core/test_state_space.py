@@ -10,7 +10,10 @@ from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import partwise, reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
-from hand_eye_calib.core.noise.outliers import chi_squares, innovation_chi_squares
+from hand_eye_calib.core.noise.outliers import (
+    chi_squares,
+    innovation_chi_squares,
+)
 from hand_eye_calib.core.noise.partwise import PartwisePosterior
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
 
@@ -166,7 +169,9 @@ def test_the_likelihood_stays_exact_where_there_is_hardly_any_walk_or_white_nois
         levels[level] -= 13.0
         space = space_of()
         expected = dense_loss(space, levels)[0]
-        assert Posterior(space, levels).loss == pytest.approx(expected, rel=1e-7)
+        assert Posterior(space, levels).loss == pytest.approx(
+            expected, rel=1e-7
+        )
 
 
 def test_a_parameter_without_information_changes_no_derivative():
@@ -348,7 +353,9 @@ def test_chi_squares_of_jitter_along_one_velocity_are_finite():
     assert 0.0 <= chi_square < 1e-3
 
 
-def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monkeypatch):
+def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(
+    monkeypatch,
+):
     monkeypatch.setattr(partwise, "MAX_POSES", 5)
     whole = replace(
         space_of(cut=(4, 9)), group_sizes=(), prior=np.eye(N_PARAMETERS + 1)
@@ -360,7 +367,8 @@ def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monke
     def space_of_part(poses):
         increments = poses[:-1]
         bases = tuple(
-            basis if len(basis) == 1 else basis[poses] for basis in whole.white_bases
+            basis if len(basis) == 1 else basis[poses]
+            for basis in whole.white_bases
         )
         fields = {"white_bases": bases, "weights": whole.weights[poses]}
         for name in (
@@ -384,7 +392,9 @@ def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(monke
     assert_allclose(
         posterior.states_after(step), expected.states_after(step), atol=1e-9
     )
-    assert_allclose(posterior.part_products().sum(axis=0), expected.products, atol=1e-9)
+    assert_allclose(
+        posterior.part_products().sum(axis=0), expected.products, atol=1e-9
+    )
     no_spikes = np.zeros(N_POSES, dtype=bool)
     of_walk, of_white = innovation_chi_squares(posterior, no_spikes)
     whole_walk, whole_white = innovation_chi_squares(expected, no_spikes)

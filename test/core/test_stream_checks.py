@@ -8,18 +8,32 @@ import tracemalloc
 import motions
 import numpy as np
 import pytest
-from faults import FAULTS, frozen, inverted, mirrored, reordered, with_swapped_axes
+from faults import (
+    FAULTS,
+    frozen,
+    inverted,
+    mirrored,
+    reordered,
+    with_swapped_axes,
+)
 from findings import codes_of
 
 from hand_eye_calib.core.alignment.similarity import EXPLAINED, fit_similarity
-from hand_eye_calib.core.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.core.alignment.time_offset import (
+    TimeOffset,
+    estimate_time_offset,
+)
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.checks import hypotheses
 from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.clock_and_scale import check_offset
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.hypothesis import HOLDS
-from hand_eye_calib.core.checks.streams import check_frozen, check_stream, frozen_share
+from hand_eye_calib.core.checks.streams import (
+    check_frozen,
+    check_stream,
+    frozen_share,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.simulation.drive import simulate, simulate_drive
@@ -35,7 +49,9 @@ from hand_eye_calib.offline.report.evidence import summarise
 def drive(seed=0, noise=0.001, wander=motions.wandering_poses, n_poses=500):
     """A walk far from the origin, so that it matters whose pose is in which frame."""
     start = se3.from_rotation_translation(np.eye(3), [30.0, -20.0, 2.0])
-    return motions.noisy_pair(start @ wander(n_poses, seed), seed + 1, noise, noise)
+    return motions.noisy_pair(
+        start @ wander(n_poses, seed), seed + 1, noise, noise
+    )
 
 
 def driving_car(n_poses=600):
@@ -73,13 +89,17 @@ def grave(agreement):
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("wander", [motions.wandering_poses, motions.planar_poses])
+@pytest.mark.parametrize(
+    "wander", [motions.wandering_poses, motions.planar_poses]
+)
 def test_no_false_alarm(seed, wander):
     agreement = check_streams(*drive(seed, wander=wander))
     assert grave(agreement) == []
 
 
-@pytest.mark.parametrize("wander", [motions.wandering_poses, motions.planar_poses])
+@pytest.mark.parametrize(
+    "wander", [motions.wandering_poses, motions.planar_poses]
+)
 def test_no_rival_is_taken_for_noisy_streams_that_agree(wander, monkeypatch):
     fits = []
 
@@ -103,7 +123,9 @@ def test_a_body_that_rotates_about_one_of_its_sensors(centred):
         motions.as_trajectory(
             motions.disturbed(se3.inverse(poses[0]) @ poses, seed, 0.005, 0.001)
         )
-        for seed, poses in enumerate(streams if centred == "parent" else streams[::-1])
+        for seed, poses in enumerate(
+            streams if centred == "parent" else streams[::-1]
+        )
     )
     assert grave(check_streams(parent, child)) == []
 
@@ -114,13 +136,17 @@ class TestTwoSensorsInOneStream:
     def codes(self, heights):
         poses = motions.planar_poses(len(heights), 4)
         poses[:, 2, 3] += heights
-        stream = motions.as_trajectory(motions.disturbed(poses, 5, 0.001, 0.001))
+        stream = motions.as_trajectory(
+            motions.disturbed(poses, 5, 0.001, 0.001)
+        )
         return set(codes_of(check_stream(stream, "child")))
 
     @pytest.mark.parametrize("shakes_hz", [3.9, 4.2, 4.7])
     def test_shaking_at_about_half_the_rate(self, shakes_hz):
         times_s = np.arange(900) / 10.0
-        assert self.codes(0.03 * np.sin(2 * np.pi * shakes_hz * times_s)) == set()
+        assert (
+            self.codes(0.03 * np.sin(2 * np.pi * shakes_hz * times_s)) == set()
+        )
 
     def test_levels_in_turn(self):
         assert self.codes(0.03 * (np.arange(900) % 2)) == {"interleaved"}
@@ -128,15 +154,21 @@ class TestTwoSensorsInOneStream:
 
 def test_one_world_for_both_streams_is_no_sign_of_inverse_poses():
     seconds = np.arange(400) * 0.05
-    turns = np.sin(np.outer(seconds, [0.7, 0.9, 0.1]) + np.array([0.0, 1.0, 0.0])) * [
+    turns = np.sin(
+        np.outer(seconds, [0.7, 0.9, 0.1]) + np.array([0.0, 1.0, 0.0])
+    ) * [
         0.3,
         0.2,
         1.2,
     ]
-    places = np.outer(seconds, [0.05, 0.07, 0.8]) + np.array([0.0, 0.0, np.pi / 2])
+    places = np.outer(seconds, [0.05, 0.07, 0.8]) + np.array(
+        [0.0, 0.0, np.pi / 2]
+    )
     places = np.sin(places) * [20.0, 20.0, 0.5]
     poses = se3.from_rotation_translation(se3.rotation_exp(turns), places)
-    noisy = motions.disturbed(motions.child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-3, 1e-3)
+    noisy = motions.disturbed(
+        motions.child_of(poses, T_cw_pw=np.eye(4)), 1, 1e-3, 1e-3
+    )
     parent = motions.as_trajectory(poses, 20)
     child = motions.as_trajectory(noisy, 20)
     assert grave(check_streams(parent, child)) == []
@@ -172,13 +204,18 @@ class TestWhichStreamAndWhatToDo:
     @pytest.mark.parametrize("factor", [np.pi / 180, 0.5])
     def test_angles_in_another_unit_or_halved(self, factor):
         parent, child = drive(wander=motions.planar_poses)
-        turns = se3.rotation_exp(factor * se3.rotation_log(child.poses[:, :3, :3]))
+        turns = se3.rotation_exp(
+            factor * se3.rotation_log(child.poses[:, :3, :3])
+        )
         poses = se3.from_rotation_translation(turns, child.poses[:, :3, 3])
         other = dataclasses.replace(child, poses=poses)
-        assert grave(check_streams(parent, other)) == [("rotation_gain", "child")]
+        assert grave(check_streams(parent, other)) == [
+            ("rotation_gain", "child")
+        ]
 
     @pytest.mark.parametrize(
-        ("damage", "code"), [(reordered, "quaternion_order"), (inverted, "inverse")]
+        ("damage", "code"),
+        [(reordered, "quaternion_order"), (inverted, "inverse")],
     )
     def test_the_parent_is_named_where_it_is_the_parent(self, damage, code):
         parent, child = drive()
@@ -188,14 +225,21 @@ class TestWhichStreamAndWhatToDo:
         parent, child = drive()
         findings = {
             f.code: f
-            for f in check_streams(parent, child.shifted(-7.25).scaled(0.5)).findings
+            for f in check_streams(
+                parent, child.shifted(-7.25).scaled(0.5)
+            ).findings
         }
         assert findings["time_offset"].options["time_offset"] == pytest.approx(
             7.25, abs=0.002
         )
-        assert findings["scale"].options["scale"] == pytest.approx(2.0, rel=0.005)
+        assert findings["scale"].options["scale"] == pytest.approx(
+            2.0, rel=0.005
+        )
         result = check_streams(
-            parent, child.shifted(-7.25).scaled(0.5), time_offset_s=7.25, scale=2.0
+            parent,
+            child.shifted(-7.25).scaled(0.5),
+            time_offset_s=7.25,
+            scale=2.0,
         )
         assert grave(result) == []
         tiny = [
@@ -205,12 +249,16 @@ class TestWhichStreamAndWhatToDo:
         assert {"scale": pytest.approx(5e-6, rel=0.005)} in tiny
         # The solve may have found a scale of its own beside the unit.
         result = check_streams(parent.scaled(1000.0), child, scale=1.17)
-        (units,) = (finding for finding in result.findings if finding.code == "units")
+        (units,) = (
+            finding for finding in result.findings if finding.code == "units"
+        )
         assert units.options == {"parent_scale": 0.001}
 
     def test_which_axes_are_swapped(self):
         parent, child = drive()
-        finding = check_streams(parent, with_swapped_axes(child, (0, 2, 1))).findings[0]
+        finding = check_streams(
+            parent, with_swapped_axes(child, (0, 2, 1))
+        ).findings[0]
         assert (finding.code, finding.stream) == ("axes", "child")
         assert "(x z y)" in finding.what
 
@@ -220,7 +268,9 @@ class TestWhichStreamAndWhatToDo:
             ("left_handed", "child")
         ]
         findings = grave(
-            check_streams(parent, reordered(child).shifted(-33.0).scaled(1000.0))
+            check_streams(
+                parent, reordered(child).shifted(-33.0).scaled(1000.0)
+            )
         )
         codes = "quaternion_order", "time_offset", "units"
         assert sorted(findings) == [(code, "child") for code in codes]
@@ -235,7 +285,8 @@ class TestWhichStreamAndWhatToDo:
         ).findings[0]
         assert (note.code, note.severity) == ("one_axis", Severity.NOTE)
         assert (
-            note.what == "y cannot be determined from this motion, and will be unknown"
+            note.what
+            == "y cannot be determined from this motion, and will be unknown"
         )
         assert note.options == {"prior.y": "VALUE+/-SIGMA"}
 
@@ -256,7 +307,9 @@ class TestOneStream:
         poses[[50, 300], :3, 3] -= 2.0  # there and back
         jumps = [
             f
-            for f in check_stream(dataclasses.replace(parent, poses=poses), "child")
+            for f in check_stream(
+                dataclasses.replace(parent, poses=poses), "child"
+            )
             if f.code == "jumps"
         ]
         assert "1.0% of the child stream's steps" in jumps[0].what
@@ -285,8 +338,12 @@ class TestOneStream:
         assert "frozen" not in codes
 
     @pytest.mark.parametrize("repeating", ["parent", "child"])
-    def test_noise_of_a_camera_beside_wheels_that_stand_is_no_motion(self, repeating):
-        streams = dict(zip(("parent", "child"), drive(n_poses=500), strict=True))
+    def test_noise_of_a_camera_beside_wheels_that_stand_is_no_motion(
+        self, repeating
+    ):
+        streams = dict(
+            zip(("parent", "child"), drive(n_poses=500), strict=True)
+        )
         for seed, (name, stream) in enumerate(streams.items()):
             stopped = with_stop(stream, 20.0, np.zeros(6))
             if name != repeating:
@@ -325,7 +382,9 @@ class TestOneStream:
         stuck = dataclasses.replace(child, poses=poses)
         assert 6.0 < frozen_share(stuck, parent) * parent.duration_s < 14.0
 
-    @pytest.mark.parametrize(("at", "few"), [(3, "the first 3"), (497, "the last 3")])
+    @pytest.mark.parametrize(
+        ("at", "few"), [(3, "the first 3"), (497, "the last 3")]
+    )
     def test_a_stamp_years_away_is_one_line_and_takes_no_memory(self, at, few):
         parent, child = drive()
         stamps_ns = child.stamps_ns.copy()
@@ -342,13 +401,17 @@ class TestOneStream:
             Severity.ERROR,
         )
         assert f"leap by 1,095 days after pose {at} of 500" in finding.what
-        assert finding.advice == f"repair the stamps, or remove {few} of its poses"
+        assert (
+            finding.advice == f"repair the stamps, or remove {few} of its poses"
+        )
         with pytest.raises(InputError, match="leap by 1,095 days"):
             estimate_time_offset(parent, far)
 
     def test_too_short_and_the_numbers_of_one_that_is_not(self):
         parent, child = drive()
-        assert grave(check_streams(parent[:3], child)) == [("too_short", "parent")]
+        assert grave(check_streams(parent[:3], child)) == [
+            ("too_short", "parent")
+        ]
         summary = summarise(drive(noise=0.0)[0])
         assert (summary.poses, summary.rate_hz) == (500, pytest.approx(10.0))
         assert summary.duration_s == pytest.approx(49.9)
@@ -363,11 +426,15 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert out.startswith("No fault found in these streams; calibrate states")
+        assert out.startswith(
+            "No fault found in these streams; calibrate states"
+        )
         assert "500" in out
         assert err == ""
 
-    def test_a_fault_is_one_line_on_stderr_and_a_table_on_stdout(self, files, capsys):
+    def test_a_fault_is_one_line_on_stderr_and_a_table_on_stdout(
+        self, files, capsys
+    ):
         parent, child = drive()
         assert main(["check", *files(parent, child.shifted(-2.0))]) == 1
         out, err = capsys.readouterr()
@@ -377,7 +444,14 @@ class TestCommand:
         )
         assert len(err.splitlines()) == 1
         assert (
-            main(["check", *files(parent, child.shifted(-2.0)), "--time-offset", "2"])
+            main(
+                [
+                    "check",
+                    *files(parent, child.shifted(-2.0)),
+                    "--time-offset",
+                    "2",
+                ]
+            )
             == 0
         )
 
@@ -415,7 +489,8 @@ class TestSlowStreams:
             for stream in drive(wander=motions.planar_poses)
         )
         assert [
-            code for code, _ in grave(check_streams(parent, child.shifted(-3.0)))
+            code
+            for code, _ in grave(check_streams(parent, child.shifted(-3.0)))
         ] == ["time_offset"]
 
 
@@ -442,11 +517,17 @@ def around_a_target(n_poses, seed):
 def test_a_camera_around_its_target_is_no_sign_of_inverse_poses(seed):
     camera = around_a_target(40, seed)
     hand = motions.child_of(
-        camera, se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])), np.eye(4)
+        camera,
+        se3.exp(np.array([0.03, -0.05, 0.08, 0.1, -0.2, 1.5])),
+        np.eye(4),
     )
     hand[:, :3, 3] -= [0.05, 0.05, -0.1]
-    parent = motions.as_trajectory(motions.disturbed(hand, seed, 2e-4, 2e-4), 1.0)
-    child = motions.as_trajectory(motions.disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0)
+    parent = motions.as_trajectory(
+        motions.disturbed(hand, seed, 2e-4, 2e-4), 1.0
+    )
+    child = motions.as_trajectory(
+        motions.disturbed(camera, seed + 9, 1e-3, 2e-3), 1.0
+    )
     assert grave(check_streams(parent, child)) == []
 
 
@@ -487,7 +568,9 @@ def test_a_short_lever_arm_is_zero_only_if_it_cannot_be_longer_than_2_mm():
         (0.02, 0.0, "time_offset", 0.02),
     ],
 )
-def test_an_offset_that_worsens_the_clocks_is_omitted(offset_s, added_s, key, option):
+def test_an_offset_that_worsens_the_clocks_is_omitted(
+    offset_s, added_s, key, option
+):
     offset = TimeOffset(seconds=offset_s, sigma_s=0.00012)
     (found,) = check_offset(offset, added_s)
     assert (found.key, found.code) == (key, "time_offset")

@@ -32,7 +32,11 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import synchronise
 from hand_eye_calib.core.results.calibration import Verdict
 from hand_eye_calib.extras.simulation.drive import simulate_drive
-from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, REALISTIC, NoiseConfig
+from hand_eye_calib.extras.simulation.options import (
+    HILLY_DRIVE,
+    REALISTIC,
+    NoiseConfig,
+)
 from reproduction import pose_faults
 from reproduction.coverage.classes import make
 from reproduction.fault_cases import FAULTS
@@ -67,7 +71,8 @@ def test_every_fault_is_named(fault):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sound_drive_has_no_finding(seed):
     assert [
-        finding.code for finding in check_streams(*_streams(drive(seed))).findings
+        finding.code
+        for finding in check_streams(*_streams(drive(seed))).findings
     ] == []
 
 
@@ -124,7 +129,9 @@ def test_exchanged_streams_on_flat_ground_are_named_by_their_displacements(
         streams.parent, streams.child, share, np.random.default_rng(0)
     )
     found = check_streams(*exchanged, earlier=None).findings
-    assert "exchanged" in {finding.code for finding in found if finding.makes_unusable}
+    assert "exchanged" in {
+        finding.code for finding in found if finding.makes_unusable
+    }
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -144,7 +151,9 @@ def _streams(simulated):
 def test_the_time_of_a_loose_mount_does_not_depend_on_noise(level):
     sound = simulate_drive(4, HILLY_DRIVE, NoiseConfig(gaussian=level))
     loosened = next(fault for fault in FAULTS if fault.code == "S8")
-    streams = loosened.damage(sound.parent, sound.child, 5.0, np.random.default_rng(1))
+    streams = loosened.damage(
+        sound.parent, sound.child, 5.0, np.random.default_rng(1)
+    )
     (finding,) = (
         f for f in check_streams(*streams).findings if f.code == "mount_moved"
     )
@@ -163,7 +172,9 @@ def rounded_pair(step_m, in_mm):
     for name, stream in streams.items():
         if in_mm in (name, "both"):
             poses = stream.poses.copy()
-            poses[:, :3, 3] = np.round(poses[:, :3, 3] / step_m) * step_m * 1000.0
+            poses[:, :3, 3] = (
+                np.round(poses[:, :3, 3] / step_m) * step_m * 1000.0
+            )
             streams[name] = Trajectory(stream.stamps_ns, poses)
     return streams["parent"], streams["child"]
 
@@ -174,7 +185,10 @@ class TestGrid:
         poses = child.poses.copy()
         poses[:, :3, 3] = np.round(poses[:, :3, 3] / 0.05) * 0.05
         (finding,) = check_stream(Trajectory(child.stamps_ns, poses), "child")
-        assert (finding.code, finding.severity) == ("coarse_positions", Severity.ERROR)
+        assert (finding.code, finding.severity) == (
+            "coarse_positions",
+            Severity.ERROR,
+        )
         assert finding.evidence["step_m"] == pytest.approx(0.05)
 
     @pytest.mark.parametrize(
@@ -196,7 +210,8 @@ class TestGrid:
 
     @pytest.mark.parametrize("stream", ["parent", "child"])
     @pytest.mark.parametrize(
-        ("step_m", "severity"), [(0.008, Severity.WARNING), (0.05, Severity.ERROR)]
+        ("step_m", "severity"),
+        [(0.008, Severity.WARNING), (0.05, Severity.ERROR)],
     )
     def test_coarse_millimetres_are_named_by_their_step_in_metres(
         self, stream, step_m, severity
@@ -205,7 +220,9 @@ class TestGrid:
         streams = rounded_pair(step_m=step_m, in_mm=stream)
         result = hec.calibrate(*streams, **{option: 0.001})
         (finding,) = (
-            finding for finding in result.findings if finding.code == "coarse_positions"
+            finding
+            for finding in result.findings
+            if finding.code == "coarse_positions"
         )
         assert (finding.stream, finding.severity) == (stream, severity)
         assert (
@@ -215,7 +232,9 @@ class TestGrid:
 
     @pytest.mark.parametrize("n_parked", [0, 100, 1000])
     @pytest.mark.parametrize("n_drives", [1, 6])
-    def test_steady_motion_is_no_grid_even_if_it_stops(self, n_parked, n_drives):
+    def test_steady_motion_is_no_grid_even_if_it_stops(
+        self, n_parked, n_drives
+    ):
         is_step = np.tile(np.repeat([1.0, 0.0], [300, n_parked]), n_drives)
         poses = np.tile(np.eye(4), (len(is_step), 1, 1))
         poses[:, 0, 3] = 0.25 * np.cumsum(is_step)
@@ -272,7 +291,9 @@ class TestOneStreamComputedFromTheOther:
 
     def found(self, parent, child):
         findings = check_streams(parent, child).findings
-        return [finding.what for finding in findings if finding.code[:3] != "one"]
+        return [
+            finding.what for finding in findings if finding.code[:3] != "one"
+        ]
 
     @pytest.mark.parametrize("rate_hz", [4.0, 11.0, 37.0])
     def test_at_any_rate(self, rate_hz):
@@ -297,7 +318,9 @@ class TestOneStreamComputedFromTheOther:
     @pytest.mark.parametrize(
         ("error_m", "width"), [(0.0, 0.01), (0.05, 0.01), (0.005, 1.0)]
     )
-    def test_with_a_little_noise_and_slow_errors_of_its_own(self, error_m, width):
+    def test_with_a_little_noise_and_slow_errors_of_its_own(
+        self, error_m, width
+    ):
         stamps_ns = drive().parent.stamps_ns
         poses = gaussian_filter1d(drive().parent.poses, width, axis=0)
         poses[:, :3, :3] = se3.nearest_rotation(poses[:, :3, :3])
@@ -305,9 +328,13 @@ class TestOneStreamComputedFromTheOther:
             np.outer(np.arange(len(poses)) / 40, [1, 0, 0, 0, 0.2, 0])
         )
         own = disturbed(
-            child_of(poses) @ se3.exp(slow), 1, *(width < 1) * np.array([1e-4, 3e-5])
+            child_of(poses) @ se3.exp(slow),
+            1,
+            *(width < 1) * np.array([1e-4, 3e-5]),
         )
-        sentences = self.found(Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own))
+        sentences = self.found(
+            Trajectory(stamps_ns, poses), Trajectory(stamps_ns, own)
+        )
         assert sentences == [
             f"the noise of both streams is unusually alike{self.QUESTION}"
         ]
@@ -323,7 +350,8 @@ class TestOneStreamComputedFromTheOther:
         )
         poses[:, :3, :3] = (world @ inner.poses @ X @ wrong)[:, :3, :3]
         assert (
-            self.found(parent, Trajectory(inner.stamps_ns, poses))[0] == self.SENTENCE
+            self.found(parent, Trajectory(inner.stamps_ns, poses))[0]
+            == self.SENTENCE
         )
 
     def test_never_use(self):
@@ -378,7 +406,10 @@ class TestParentFusedFromTheChild:
         truth = make(kind, 901)
         inside = slice(2, -2)
         parent = fused(
-            truth.parent[inside], truth.child, truth.T_parent_child @ self.WRONG, tau_s
+            truth.parent[inside],
+            truth.child,
+            truth.T_parent_child @ self.WRONG,
+            tau_s,
         )
         result = hec.calibrate(parent, truth.child)
         assert result.verdict is not Verdict.USE
@@ -390,7 +421,9 @@ class TestParentFusedFromTheChild:
 
     @pytest.mark.parametrize("tau_s", [0.3, 2.0])
     @pytest.mark.parametrize("filtered", ["parent", "child"])
-    def test_the_finding_names_the_error_of_the_assumed_mount(self, filtered, tau_s):
+    def test_the_finding_names_the_error_of_the_assumed_mount(
+        self, filtered, tau_s
+    ):
         truth = make("hand_vio_walk", 902)
         parent = truth.parent[2:-2]
         child = truth.child
@@ -398,9 +431,13 @@ class TestParentFusedFromTheChild:
         if filtered == "parent":
             parent = fused(parent, child, assumed, tau_s)
         else:
-            child = fused(child[2:-2], truth.parent, se3.inverse(assumed), tau_s)
+            child = fused(
+                child[2:-2], truth.parent, se3.inverse(assumed), tau_s
+            )
         findings = check_streams(parent, child).findings
-        (finding,) = [found for found in findings if found.code == "not_independent"]
+        (finding,) = [
+            found for found in findings if found.code == "not_independent"
+        ]
         assert finding.severity is Severity.ERROR
         wrong_rad = np.linalg.norm(self.WRONG_ROTATION)
         assert finding.evidence["turn_rad"] == pytest.approx(wrong_rad, rel=0.4)
@@ -409,12 +446,17 @@ class TestParentFusedFromTheChild:
 
     def test_a_wrong_lever_arm_alone_is_questioned(self):
         truth = make("hand_vio_walk", 902)
-        shift = se3.from_rotation_translation(np.eye(3), np.array([0.05, -0.05, 0.04]))
+        shift = se3.from_rotation_translation(
+            np.eye(3), np.array([0.05, -0.05, 0.04])
+        )
         parent = fused(
             truth.parent[2:-2], truth.child, truth.T_parent_child @ shift, 0.1
         )
         (finding,) = check_streams(parent, truth.child).findings
-        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert (finding.code, finding.severity) == (
+            "not_independent",
+            Severity.WARNING,
+        )
         assert finding.evidence["shift_m"] == pytest.approx(0.081, rel=0.2)
 
     @pytest.mark.parametrize("seed", [61, 62])
@@ -424,24 +466,42 @@ class TestParentFusedFromTheChild:
         assert codes == ["one_axis"]
 
     @pytest.mark.parametrize("kind", ["car_ins_lidar", "agv_long"])
-    def test_streams_that_never_drift_apart_on_a_long_path_are_questioned(self, kind):
+    def test_streams_that_never_drift_apart_on_a_long_path_are_questioned(
+        self, kind
+    ):
         truth = make(kind, 901)
-        copies = truth.child.poses @ se3.inverse(truth.T_parent_child @ self.WRONG)
-        parent = Trajectory(truth.child.stamps_ns, disturbed(copies, 3, 0.01, 0.002))
+        copies = truth.child.poses @ se3.inverse(
+            truth.T_parent_child @ self.WRONG
+        )
+        parent = Trajectory(
+            truth.child.stamps_ns, disturbed(copies, 3, 0.01, 0.002)
+        )
         (finding,) = check_streams(parent, truth.child).findings
-        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert (finding.code, finding.severity) == (
+            "not_independent",
+            Severity.WARNING,
+        )
         assert finding.what.startswith("the streams drift apart by only ")
         assert finding.what.endswith(TestOneStreamComputedFromTheOther.QUESTION)
         assert check_streams(parent, truth.child, are_exact=True).findings == ()
         assert check_streams(truth.parent, truth.child).findings == ()
 
     @pytest.mark.parametrize("kind", ["hand_vio_walk", "drone_two_vios"])
-    def test_a_copy_with_noise_of_its_own_is_questioned_on_a_short_path(self, kind):
+    def test_a_copy_with_noise_of_its_own_is_questioned_on_a_short_path(
+        self, kind
+    ):
         truth = make(kind, 901)
-        copies = truth.child.poses @ se3.inverse(truth.T_parent_child @ self.WRONG)
-        parent = Trajectory(truth.child.stamps_ns, disturbed(copies, 3, 0.003, 0.0015))
+        copies = truth.child.poses @ se3.inverse(
+            truth.T_parent_child @ self.WRONG
+        )
+        parent = Trajectory(
+            truth.child.stamps_ns, disturbed(copies, 3, 0.003, 0.0015)
+        )
         (finding,) = check_streams(parent, truth.child).findings
-        assert (finding.code, finding.severity) == ("not_independent", Severity.WARNING)
+        assert (finding.code, finding.severity) == (
+            "not_independent",
+            Severity.WARNING,
+        )
         assert finding.what.endswith(TestOneStreamComputedFromTheOther.QUESTION)
         assert check_streams(parent, truth.child, are_exact=True).findings == ()
 
@@ -480,7 +540,9 @@ def test_a_shift_is_found_with_its_time_and_size(share):
 def test_the_size_of_a_small_shift_is_right_on_average():
     sizes = []
     for seed in range(5):
-        pose_pairs, truth = recording(seed, lambda at: np.where(at < 0.5, 0.0, 0.3))
+        pose_pairs, truth = recording(
+            seed, lambda at: np.where(at < 0.5, 0.0, 0.3)
+        )
         change = find_change(pose_pairs, truth)
         weights = np.linalg.inv(change.covariance)
         sizes.append(change.xi @ weights @ SHIFT / (SHIFT @ weights @ SHIFT))
@@ -499,7 +561,9 @@ def test_noise_and_a_wrong_extrinsic_are_no_shift_and_a_short_recording_tells_no
     for seed in range(4):
         pose_pairs, truth = recording(seed)
         assert find_change(pose_pairs, truth).log_ratio < SIGNIFICANT
-    assert find_change(pose_pairs, truth @ se3.exp(SHIFT)).log_ratio < SIGNIFICANT
+    assert (
+        find_change(pose_pairs, truth @ se3.exp(SHIFT)).log_ratio < SIGNIFICANT
+    )
     assert find_change(pose_pairs[:200], truth) is None
 
 
@@ -507,7 +571,10 @@ def products_of(steps, sigma=0.01):
     """Products of parts that each show a shift (6,) to this standard deviation."""
     parts = []
     for step in steps:
-        rows = np.concatenate([np.eye(6), -np.asarray(step)[:, None]], axis=1) / sigma
+        rows = (
+            np.concatenate([np.eye(6), -np.asarray(step)[:, None]], axis=1)
+            / sigma
+        )
         parts.append(rows.T @ rows)
     return np.array(parts)
 
@@ -560,7 +627,11 @@ class TestGraveAgain:
     @pytest.mark.parametrize(
         ("code", "severity", "name"),
         [
-            ("S2", 0, "same_position"),  # positions of the parent with 1 cm of noise
+            (
+                "S2",
+                0,
+                "same_position",
+            ),  # positions of the parent with 1 cm of noise
             ("S4", 1, "position_clock"),  # low-passed by 100 ms
             ("V1", 1, "position_clock"),  # the parent's positions 50 ms late
             ("V2", 2, "position_clock"),  # orientations 100 ms late

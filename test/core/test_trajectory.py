@@ -136,7 +136,9 @@ def middles(trajectory):
     return (starts_ns + ends_ns) // 2
 
 
-@pytest.mark.parametrize(("hz", "share"), [(0.5, 0.05), (1.0, 0.15), (2.0, 0.4)])
+@pytest.mark.parametrize(
+    ("hz", "share"), [(0.5, 0.05), (1.0, 0.15), (2.0, 0.4)]
+)
 def test_a_shake_is_cut_far_less_than_by_a_constant_twist(hz, share):
     trajectory_s = np.arange(200) / HZ
     trajectory = as_trajectory(shaking(hz, trajectory_s), HZ)

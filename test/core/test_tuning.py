@@ -128,13 +128,17 @@ def numbers_of(case, tuning):
     """Return the numbers of the solution of a case."""
     if case in POSES:
         parent, child = POSES[case]()
-        solution = estimator.solve(stamps(N_POSES), parent, child, tuning=tuning)
+        solution = estimator.solve(
+            stamps(N_POSES), parent, child, tuning=tuning
+        )
         answer = solution.T_parent_child, solution.cov_parent_child_in_child
     else:
         odometry, measured = antenna()
         with_scale = case == "antenna of another scale"
         times_ns = stamps(N_POSES)
-        solution = positions.solve(times_ns, odometry, measured, with_scale, tuning)
+        solution = positions.solve(
+            times_ns, odometry, measured, with_scale, tuning
+        )
         answer = solution.lever_arm, solution.covariance
     return np.concatenate(
         [np.ravel(array) for array in (*answer, solution.levels)]
@@ -176,7 +180,10 @@ CHANGES = {
     "rounds": (5, "antenna"),
     "fits": ((1, 2, 4), "antenna"),
     "rotation_walk": ((-26.6, -12.8, -1.3), "antenna"),
-    "of_positions": (tuple(2.0 * sigma for sigma in TUNING.of_positions), "antenna"),
+    "of_positions": (
+        tuple(2.0 * sigma for sigma in TUNING.of_positions),
+        "antenna",
+    ),
     "accelerating_s": (0.4, "antenna"),
     "longest_span_factor": (5.0, "antenna"),
     "jump_factor": (20.0, "antenna"),
@@ -201,7 +208,9 @@ def test_a_number_that_is_passed_changes_the_solution(name):
 
 def test_the_same_numbers_give_the_same_solution():
     for case in ("drive", "antenna"):
-        assert numbers_of.__wrapped__(case, replace(TUNING)) == numbers_of(case, TUNING)
+        assert numbers_of.__wrapped__(case, replace(TUNING)) == numbers_of(
+            case, TUNING
+        )
 
 
 def names_of_the_default(tree):
@@ -209,12 +218,16 @@ def names_of_the_default(tree):
     is_default = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.arguments):
-            is_default |= {id(value) for value in (*node.defaults, *node.kw_defaults)}
+            is_default |= {
+                id(value) for value in (*node.defaults, *node.kw_defaults)
+            }
         if isinstance(node, ast.AnnAssign):
             is_default.add(id(node.value))
     names = [node for node in ast.walk(tree) if isinstance(node, ast.Name)]
     return [
-        node for node in names if node.id == "TUNING" and id(node) not in is_default
+        node
+        for node in names
+        if node.id == "TUNING" and id(node) not in is_default
     ]
 
 
@@ -224,7 +237,9 @@ def test_no_search_reads_the_default_instead_of_what_was_passed():
     searches = [path for place in folders for path in place.glob("*.py")]
     reading = {}
     for path in searches:
-        names = names_of_the_default(ast.parse(path.read_text(encoding="utf-8")))
+        names = names_of_the_default(
+            ast.parse(path.read_text(encoding="utf-8"))
+        )
         if path.name != "tuning.py" and names:
             reading[path.name] = [node.lineno for node in names]
     assert len(searches) > 8
@@ -232,5 +247,9 @@ def test_no_search_reads_the_default_instead_of_what_was_passed():
 
 
 def test_reading_the_default_is_detected():
-    source = "def f(tuning=TUNING):\n    x: int = TUNING\n    return TUNING.few\n"
-    assert [node.lineno for node in names_of_the_default(ast.parse(source))] == [3]
+    source = (
+        "def f(tuning=TUNING):\n    x: int = TUNING\n    return TUNING.few\n"
+    )
+    assert [
+        node.lineno for node in names_of_the_default(ast.parse(source))
+    ] == [3]

@@ -8,7 +8,11 @@ from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.alignment.similarity import estimate_scale
-from hand_eye_calib.core.checks.streams import check_lengths, is_too_fast, is_too_slow
+from hand_eye_calib.core.checks.streams import (
+    check_lengths,
+    is_too_fast,
+    is_too_slow,
+)
 from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
@@ -19,7 +23,12 @@ from hand_eye_calib.extras.simulation.options import HILLY_DRIVE, NoiseConfig
 from reproduction.coverage import classes, mixed
 from reproduction.coverage.classes import make
 
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048}
+UNITS = {
+    "millimetres": 1e-3,
+    "centimetres": 1e-2,
+    "inches": 0.0254,
+    "feet": 0.3048,
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +50,9 @@ def moving_at(speed_m_s):
     places = speed_m_s * np.stack(
         [times_s, np.sin(0.3 * times_s), 0.0 * times_s], axis=1
     )
-    return Trajectory.from_positions(np.round(1e9 * times_s).astype(np.int64), places)
+    return Trajectory.from_positions(
+        np.round(1e9 * times_s).astype(np.int64), places
+    )
 
 
 class TestRatio:
@@ -70,7 +81,8 @@ class TestRatio:
             assert f"parent_scale {factor:g}" in finding.advice
 
     @pytest.mark.parametrize(
-        ("off", "is_exact"), [(1.002, 1.0), (1.004, 1.0), (1.006, 0.0), (0.96, 0.0)]
+        ("off", "is_exact"),
+        [(1.002, 1.0), (1.004, 1.0), (1.006, 0.0), (0.96, 0.0)],
     )
     def test_a_ratio_near_a_unit_is_a_question(self, off, is_exact):
         streams = moving_at(2.0), moving_at(0.6)
@@ -84,15 +96,21 @@ class TestRatio:
     def test_a_parent_faster_than_sound_in_metres_is_in_that_unit(self, unit):
         factor = UNITS[unit]
         finding = in_other_units(
-            1.0 / factor, 0.001 / factor, moving_at(8.0 / factor), moving_at(8.0)
+            1.0 / factor,
+            0.001 / factor,
+            moving_at(8.0 / factor),
+            moving_at(8.0),
         )
         assert (finding.code, finding.stream) == ("units", "parent")
         assert finding.options == {"parent_scale": factor}
 
-    @pytest.mark.parametrize("scale", [1.05, 3.09, 3.48, 2.0, 10.0, 0.1, 0.28, 0.32])
+    @pytest.mark.parametrize(
+        "scale", [1.05, 3.09, 3.48, 2.0, 10.0, 0.1, 0.28, 0.32]
+    )
     def test_a_scale_near_no_unit_is_a_scale(self, scale):
         assert (
-            in_other_units(scale, 0.005, moving_at(1.0), moving_at(1.0 / scale)) is None
+            in_other_units(scale, 0.005, moving_at(1.0), moving_at(1.0 / scale))
+            is None
         )
 
     def test_speeds_of_sensors(self):
@@ -115,12 +133,16 @@ class TestResult:
     @pytest.mark.parametrize("unit", UNITS)
     def test_a_child_in_another_unit_is_repaired(self, hand, expected, unit):
         parent, child = hand
-        result = hec.calibrate(parent, child.scaled(1.0 / UNITS[unit]), reference="B5")
+        result = hec.calibrate(
+            parent, child.scaled(1.0 / UNITS[unit]), reference="B5"
+        )
         assert result.scale == UNITS[unit]
         assert_allclose(result.T_parent_child, expected, atol=0.01)
         assert result.findings == ()
 
-    def test_a_parent_in_millimetres_is_repaired_with_care(self, hand, expected):
+    def test_a_parent_in_millimetres_is_repaired_with_care(
+        self, hand, expected
+    ):
         parent, child = hand
         result = hec.calibrate(parent.scaled(1000.0), child, reference="B5")
         assert_allclose(result.T_parent_child, expected, atol=0.01)
@@ -134,10 +156,14 @@ class TestResult:
         parent = parent.scaled(1.0 / 0.3048)
         result = hec.calibrate(parent, child, reference="B5")
         assert result.verdict is hec.Verdict.DO_NOT_USE
-        (finding,) = (finding for finding in result.findings if finding.makes_unusable)
+        (finding,) = (
+            finding for finding in result.findings if finding.makes_unusable
+        )
         assert finding.code == "unit_or_scale"
         assert result.scale == pytest.approx(3.2808, abs=0.01)
-        answered = hec.calibrate(parent, child, reference="B5", parent_scale=0.3048)
+        answered = hec.calibrate(
+            parent, child, reference="B5", parent_scale=0.3048
+        )
         assert_allclose(answered.T_parent_child, expected, atol=0.01)
         assert not any(finding.makes_unusable for finding in answered.findings)
         assert (
@@ -152,7 +178,9 @@ class TestResult:
         self, hand, expected, scale
     ):
         parent, child = hand
-        result = hec.calibrate(parent, child.scaled(1.0 / scale), reference="B5")
+        result = hec.calibrate(
+            parent, child.scaled(1.0 / scale), reference="B5"
+        )
         assert result.scale == pytest.approx(scale, rel=0.005)
         assert_allclose(result.T_parent_child, expected, atol=0.02)
         assert not any(finding.makes_unusable for finding in result.findings)
@@ -163,10 +191,12 @@ class TestResult:
     @pytest.mark.parametrize("unit", ["millimetres", "feet"])
     def test_no_platform_is_wrong_without_a_word(self, name, unit):
         drive = make(name, 31)
-        result = hec.calibrate(drive.parent.scaled(1.0 / UNITS[unit]), drive.child)
-        error_m = np.abs(deviation(result.T_parent_child, drive.T_parent_child))[
-            :3
-        ].max()
+        result = hec.calibrate(
+            drive.parent.scaled(1.0 / UNITS[unit]), drive.child
+        )
+        error_m = np.abs(
+            deviation(result.T_parent_child, drive.T_parent_child)
+        )[:3].max()
         assert error_m < 0.2 or result.verdict is hec.Verdict.DO_NOT_USE
 
 
@@ -246,7 +276,9 @@ PLATFORMS = (
     ("unit", "factor"), [("millimetres", 1e-3), ("centimetres", 1e-2)]
 )
 @pytest.mark.parametrize("platform", PLATFORMS)
-def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, measures):
+def test_both_streams_in_a_small_unit_are_named_first(
+    platform, unit, factor, measures
+):
     drive = make(platform, 1701)
     parent = drive.parent.scaled(1.0 / factor)
     child = drive.child.scaled(1.0 / factor)
@@ -256,7 +288,11 @@ def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, me
     assert (first.code, first.stream) == ("lengths", "both")
     assert unit in first.what
     right = hec.calibrate(
-        parent, child, child_measures=measures, parent_scale=factor, scale=factor
+        parent,
+        child,
+        child_measures=measures,
+        parent_scale=factor,
+        scale=factor,
     )
     assert "lengths" not in codes_of(right.findings)
 
@@ -264,8 +300,12 @@ def test_both_streams_in_a_small_unit_are_named_first(platform, unit, factor, me
 class TestSmallUnit:
     """``check_lengths`` of streams that agree in one unit."""
 
-    @pytest.mark.parametrize(("lever_arm_m", "codes"), [(2.9, []), (3.0, ["lengths"])])
-    def test_a_large_machine_changes_its_velocity_slowly(self, lever_arm_m, codes):
+    @pytest.mark.parametrize(
+        ("lever_arm_m", "codes"), [(2.9, []), (3.0, ["lengths"])]
+    )
+    def test_a_large_machine_changes_its_velocity_slowly(
+        self, lever_arm_m, codes
+    ):
         poses = wandering_poses(1200, step_m=0.6)
         arm = as_trajectory(poses)
         lengths = check_lengths(arm, arm, lever_arm_m)
@@ -274,7 +314,10 @@ class TestSmallUnit:
     def test_a_child_in_metres_is_not_asked_about(self, hand):
         parent, child = hand
         (finding,) = check_lengths(parent.scaled(1000.0), child)
-        assert (finding.stream, [*finding.options]) == ("parent", ["parent_scale"])
+        assert (finding.stream, [*finding.options]) == (
+            "parent",
+            ["parent_scale"],
+        )
 
     @pytest.mark.parametrize(
         ("n_poses", "step_m"), [(360, 0.1), (360, 0.17), (180, 0.17)]
@@ -285,7 +328,13 @@ class TestSmallUnit:
         poses = wandering_poses(n_poses, step_m=step_m)
         X = se3.exp(np.array([0.1, -0.05, 0.03, -1.5, 0.1, -1.6]))
         parent = as_trajectory(disturbed(poses, 10, 0.01, 0.002)).scaled(1000.0)
-        child = as_trajectory(disturbed(poses @ X, 1, 0.01, 0.002)).scaled(1000.0)
+        child = as_trajectory(disturbed(poses @ X, 1, 0.01, 0.002)).scaled(
+            1000.0
+        )
         result = hec.calibrate(parent, child)
-        codes = [finding.code for finding in result.findings if finding.makes_unusable]
+        codes = [
+            finding.code
+            for finding in result.findings
+            if finding.makes_unusable
+        ]
         assert codes == ["lengths"]

@@ -12,7 +12,11 @@ from result_making import NAMES, dofs, written_finding
 from result_making import good_calibration as good
 from source_code import ROOT
 
-from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    SolveStatus,
+    Verdict,
+)
 from hand_eye_calib.core.results.records import AxisScatter, Severity
 from hand_eye_calib.core.results.rules import RULES
 from hand_eye_calib.core.results.verdict import shown
@@ -21,14 +25,19 @@ from hand_eye_calib.extras.fleet.records import Together
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 
 PAGE = ROOT / "docs" / "verdict.md"
-TABLE = re.compile(r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)")
+TABLE = re.compile(
+    r"(?<=<!-- rules: begin -->\n)(.*\n)*(?=<!-- rules: end -->)"
+)
 
 
 def table():
     rows = [
-        f"| `{rule.name}` | {rule.when} | `{rule.verdict.value}` |\n" for rule in RULES
+        f"| `{rule.name}` | {rule.when} | `{rule.verdict.value}` |\n"
+        for rule in RULES
     ]
-    return "".join(["\n| Rule | If | Verdict |\n| --- | --- | --- |\n", *rows, "\n"])
+    return "".join(
+        ["\n| Rule | If | Verdict |\n| --- | --- | --- |\n", *rows, "\n"]
+    )
 
 
 def test_the_page_has_the_rules_of_the_code():
@@ -39,9 +48,13 @@ def test_the_page_has_the_rules_of_the_code():
 
 def observed(sigma_m=0.003, sigma_rad=0.001, **changes):
     """Verdicts of six axes; ``changes`` names axes with another sigma (inf: unobservable)."""
-    sigmas = dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3), strict=True)) | changes
+    sigmas = (
+        dict(zip(NAMES, np.repeat([sigma_m, sigma_rad], 3), strict=True))
+        | changes
+    )
     return dofs(
-        sigmas.values(), [name for name, sigma in sigmas.items() if sigma == np.inf]
+        sigmas.values(),
+        [name for name, sigma in sigmas.items() if sigma == np.inf],
     )
 
 
@@ -71,7 +84,10 @@ GROUND_AXIS = GroundAxis("roll", 0.0, 0.002, 0.02, 0.001, 9.0, False)
 
 # An error of 1 m or 1 rad would not have shown.
 NOTHING_SHOWS = Detectability(
-    errors=dict.fromkeys(NAMES, 1.0), shifts={}, time_offset_s=np.inf, scale=np.inf
+    errors=dict.fromkeys(NAMES, 1.0),
+    shifts={},
+    time_offset_s=np.inf,
+    scale=np.inf,
 )
 
 
@@ -87,7 +103,9 @@ CASES = {
         findings=(dataclasses.replace(FINDING, severity=Severity.WARNING),)
     ),
     "ground": dict(
-        parts={"ground": GroundResult("ground", "ground", False, (GROUND_AXIS,))}
+        parts={
+            "ground": GroundResult("ground", "ground", False, (GROUND_AXIS,))
+        }
     ),
     "recordings": dict(parts={"together": several("one off")}),
     "halves": dict(cross_check=checked("x", 0.02, 3.5, "halves")),
@@ -151,7 +169,9 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
 
 
 @pytest.mark.parametrize("more", [{}, {"roll": 0.02}])
-def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(more):
+def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(
+    more,
+):
     (reason,) = good(
         **CASES["floor"], observability_measured=observed(x=0.04, **more)
     ).reasons
@@ -167,7 +187,9 @@ def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target
 
 
 def test_axes_that_cannot_be_determined_are_named_together():
-    result = good(observability_measured=observed(z=np.inf, roll=np.inf, yaw=np.inf))
+    result = good(
+        observability_measured=observed(z=np.inf, roll=np.inf, yaw=np.inf)
+    )
     sentence = "z and the rotations about x and z cannot be determined from this motion"
     assert result.reasons[0].sentence == sentence
 
@@ -181,7 +203,10 @@ def test_a_large_scatter_of_references_is_not_excused_by_their_own_uncertainty()
 
 
 def test_a_method_that_models_the_noise_may_reject_less():
-    assert good(method="adaptive", n_pairs=100, n_inliers=80).verdict is Verdict.USE
+    assert (
+        good(method="adaptive", n_pairs=100, n_inliers=80).verdict
+        is Verdict.USE
+    )
     rejecting = good(method="adaptive", n_pairs=100, n_inliers=79)
     assert [reason.rule for reason in rejecting.reasons] == ["outliers"]
 
@@ -189,7 +214,10 @@ def test_a_method_that_models_the_noise_may_reject_less():
 def test_nothing_against_it_is_use():
     result = good()
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
-    assert result.headline == "USE: good to 3 mm and 0.057 deg on every axis (1 sigma)"
+    assert (
+        result.headline
+        == "USE: good to 3 mm and 0.057 deg on every axis (1 sigma)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -214,14 +242,18 @@ def test_what_does_not_count(changes):
 
 
 def test_the_gravest_reason_comes_first_and_decides():
-    result = good(**CASES["target"] | CASES["error_finding"] | CASES["outliers"])
+    result = good(
+        **CASES["target"] | CASES["error_finding"] | CASES["outliers"]
+    )
     assert [reason.rule for reason in result.reasons] == [
         "error_finding",
         "outliers",
         "target",
     ]
     assert result.headline == "DO NOT USE: lengths are in mm"
-    assert [reason.rule for reason in shown(result.reasons)] == ["error_finding"]
+    assert [reason.rule for reason in shown(result.reasons)] == [
+        "error_finding"
+    ]
     assert len(shown(good(**CASES["target"] | CASES["outliers"]).reasons)) == 2
 
 
@@ -230,7 +262,9 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
     assert hidden.headline == "USE WITH CARE: all but z; measure z by hand"
     assert repr(hidden).startswith(f"<Calibration: {hidden.headline}\n")
     both = good(observability_measured=observed(y=np.inf, z=np.inf))
-    assert both.headline == "USE WITH CARE: all but y and z; measure them by hand"
+    assert (
+        both.headline == "USE WITH CARE: all but y and z; measure them by hand"
+    )
     assert both.reasons[0].what_to_do == (
         "measure them by hand and give priors, such as "
         'prior={"y": (0.50, 0.02), "z": (0.50, 0.02)}'
@@ -240,7 +274,9 @@ def test_an_axis_that_is_not_shown_does_not_spoil_the_others():
 def test_axes_out_of_reach_are_not_among_the_known_axes():
     rotations = good(
         measured="rotations",
-        observability_measured=observed(x=np.inf, y=np.inf, z=np.inf, yaw=np.inf),
+        observability_measured=observed(
+            x=np.inf, y=np.inf, z=np.inf, yaw=np.inf
+        ),
     )
     assert rotations.headline == (
         "USE WITH CARE: roll and pitch only; measure yaw by hand"
@@ -283,10 +319,16 @@ if __name__ == "__main__":
             0.004,
             "x is good to 2.03 cm; the target is 2 cm. Part of it is an allowance",
         ),
-        (0.0004, 0.0200001, "x is good to 2.0004 cm; the target is 2 cm. Most of it"),
+        (
+            0.0004,
+            0.0200001,
+            "x is good to 2.0004 cm; the target is 2 cm. Most of it",
+        ),
     ],
 )
-def test_a_size_above_its_target_has_the_digits_that_show_it(sigma, allowance, begins):
+def test_a_size_above_its_target_has_the_digits_that_show_it(
+    sigma, allowance, begins
+):
     result = good(
         T_parent_child=np.eye(4),
         observability_measured=observed(x=sigma),
@@ -299,12 +341,17 @@ def test_a_size_above_its_target_has_the_digits_that_show_it(sigma, allowance, b
 
 def test_a_measured_size_just_above_its_target_has_the_digits_that_show_it():
     (reason,) = good(observability_measured=observed(x=0.02003)).reasons
-    assert reason.sentence == "standard deviations above the target of 2 cm: x 2.003 cm"
+    assert (
+        reason.sentence
+        == "standard deviations above the target of 2 cm: x 2.003 cm"
+    )
 
 
 def test_several_axes_and_targets_are_named_together():
     allowance = np.diag([0.03, 0.04, 0, 0, 0, np.radians(0.4)]) ** 2
-    (reason,) = good(T_parent_child=np.eye(4), covariance_allowance=allowance).reasons
+    (reason,) = good(
+        T_parent_child=np.eye(4), covariance_allowance=allowance
+    ).reasons
     assert reason.sentence == (
         "x is good to 3 cm, y to 4 cm and the rotation about z to 0.4 deg; the targets are 2 cm "
         "and 0.3 deg. Most of it is an allowance for constant odometry errors"

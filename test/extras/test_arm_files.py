@@ -40,7 +40,10 @@ def opencv(both_poses):
 
 
 def easy_handeye2(both_poses):
-    parameters = {"robot_effector_frame": "tool0", "tracking_base_frame": "camera"}
+    parameters = {
+        "robot_effector_frame": "tool0",
+        "tracking_base_frame": "camera",
+    }
     samples = [
         {"robot": transform_of(a), "tracking": transform_of(b)}
         for a, b in zip(*both_poses, strict=True)
@@ -63,14 +66,20 @@ def moveit_json(both_poses):
     )
 
 
-@pytest.mark.parametrize("written", [opencv, easy_handeye2, moveit_yaml, moveit_json])
+@pytest.mark.parametrize(
+    "written", [opencv, easy_handeye2, moveit_yaml, moveit_json]
+)
 def test_files_of_other_tools(written, both_poses, tmp_path):
     path = tmp_path / "samples.yaml"
     path.write_text(written(both_poses))
     read = read_arm_samples(path)
     assert_allclose(read.robot, both_poses[0], atol=1e-12)
     assert_allclose(read.tracking, both_poses[1], atol=1e-12)
-    frames = {"hand": "tool0", "camera": "camera"} if written is easy_handeye2 else {}
+    frames = (
+        {"hand": "tool0", "camera": "camera"}
+        if written is easy_handeye2
+        else {}
+    )
     assert read.frames == frames
 
 
@@ -101,7 +110,9 @@ def test_the_calibration_of_the_same_name_states_the_place_of_the_camera(
     assert read.calibration == calibration
 
 
-def test_a_calibration_is_not_read_if_the_samples_state_the_place(both_poses, tmp_path):
+def test_a_calibration_is_not_read_if_the_samples_state_the_place(
+    both_poses, tmp_path
+):
     document = json.loads(easy_handeye2(both_poses))
     document["parameters"]["calibration_type"] = "eye_in_hand"
     path = tmp_path / "arm.samples"
@@ -129,11 +140,16 @@ def test_the_command_names_the_calibration_that_states_the_place(
     assert "arm.calib" in printed.err
     result = json.loads(printed.out)
     assert result["parent_frame"] == "link0"
-    assert_allclose(result["T_parent_child"]["matrix"], camera_in_base, atol=1e-6)
+    assert_allclose(
+        result["T_parent_child"]["matrix"], camera_in_base, atol=1e-6
+    )
 
 
 def test_the_report_of_an_arm_states_the_error_of_a_near_object(tmp_path):
-    assert main(["calibrate", "sample:arm.yaml", "--out", str(tmp_path / "arm")]) == 0
+    assert (
+        main(["calibrate", "sample:arm.yaml", "--out", str(tmp_path / "arm")])
+        == 0
+    )
     page = (tmp_path / "arm" / "report.html").read_text()
     assert (
         "The position of an object 0.5 m from camera has a standard deviation of"
@@ -149,18 +165,36 @@ HALF_ROOT = 0.5**0.5
 
 def about(axis, angle_deg):
     """Return the rotation (3, 3) about an axis."""
-    return se3.rotation_exp(np.radians(angle_deg) * np.eye(3)["xyz".index(axis)])
+    return se3.rotation_exp(
+        np.radians(angle_deg) * np.eye(3)["xyz".index(axis)]
+    )
 
 
 @pytest.mark.parametrize(
     ("robot", "angles", "expected"),
     [
         ("abb", [HALF_ROOT, 0, 0, HALF_ROOT], about("z", 90)),
-        ("fanuc", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
-        ("kawasaki", [10, 20, 30], about("z", 10) @ about("y", 20) @ about("z", 30)),
-        ("kuka", [10, 20, 30], about("z", 10) @ about("y", 20) @ about("x", 30)),
+        (
+            "fanuc",
+            [10, 20, 30],
+            about("z", 30) @ about("y", 20) @ about("x", 10),
+        ),
+        (
+            "kawasaki",
+            [10, 20, 30],
+            about("z", 10) @ about("y", 20) @ about("z", 30),
+        ),
+        (
+            "kuka",
+            [10, 20, 30],
+            about("z", 10) @ about("y", 20) @ about("x", 30),
+        ),
         ("ur", [0, np.pi / 2, 0], about("y", 90)),
-        ("yaskawa", [10, 20, 30], about("z", 30) @ about("y", 20) @ about("x", 10)),
+        (
+            "yaskawa",
+            [10, 20, 30],
+            about("z", 30) @ about("y", 20) @ about("x", 10),
+        ),
     ],
 )
 def test_angles_of_robots(robot, angles, expected):
@@ -172,11 +206,15 @@ def test_angles_of_robots(robot, angles, expected):
 def test_an_unknown_robot_or_a_wrong_number_of_values_is_refused():
     with pytest.raises(ConfigError, match="must be one of abb, fanuc"):
         hec.robot_poses([[0.0] * 6], "r2d2")
-    with pytest.raises(InputError, match="a pose of abb has 7 numbers; found 6"):
+    with pytest.raises(
+        InputError, match="a pose of abb has 7 numbers; found 6"
+    ):
         hec.robot_poses([[0.0] * 6], "abb")
 
 
-def test_the_file_of_a_hand_has_the_angles_of_its_robot(both_poses, tmp_path, capsys):
+def test_the_file_of_a_hand_has_the_angles_of_its_robot(
+    both_poses, tmp_path, capsys
+):
     Ts_base_hand = both_poses[0]
     T_hand_camera = se3.exp(np.array([0.05, 0.02, 0.1, 0.3, -0.2, 1.0]))
     T_base_target = se3.exp(np.array([0.5, 0.1, 0.0, 0.1, 0.2, 0.3]))
@@ -189,11 +227,18 @@ def test_the_file_of_a_hand_has_the_angles_of_its_robot(both_poses, tmp_path, ca
     command = ["calibrate", str(hand), str(camera), "--order", "none"]
     assert main([*command, "--parent-angles", "kuka", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert_allclose(result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6)
+    assert_allclose(
+        result["T_parent_child"]["matrix"], T_hand_camera, atol=1e-6
+    )
 
 
 def test_angles_of_a_robot_are_refused_for_samples(tmp_path, capsys):
-    command = ["calibrate", str(tmp_path / "samples.yaml"), "--parent-angles", "kuka"]
+    command = [
+        "calibrate",
+        str(tmp_path / "samples.yaml"),
+        "--parent-angles",
+        "kuka",
+    ]
     assert main(command) == 2
     assert "--parent-angles" in capsys.readouterr().err
 
@@ -218,7 +263,9 @@ def write_zivid(folder, stop, robot, target):
             "PoseState: !!opencv-matrix\n   rows: 4\n   cols: 4\n "
             f"  dt: d\n   data: [{numbers}]\n"
         )
-        (folder / name / f"pos{stop:02d}.yaml").write_text(f"%YAML:1.0\n---\n{text}")
+        (folder / name / f"pos{stop:02d}.yaml").write_text(
+            f"%YAML:1.0\n---\n{text}"
+        )
 
 
 def write_rows_of_matrices(folder, stop, robot, target):
@@ -232,7 +279,8 @@ def write_poses_and_targets(folder, stop, robot, target):
 
 
 @pytest.mark.parametrize(
-    "write", [write_visp, write_zivid, write_rows_of_matrices, write_poses_and_targets]
+    "write",
+    [write_visp, write_zivid, write_rows_of_matrices, write_poses_and_targets],
 )
 def test_a_folder_with_a_file_for_each_pose(write, both_poses, tmp_path):
     for stop, (robot, target) in enumerate(zip(*both_poses, strict=True)):
@@ -252,7 +300,9 @@ def test_a_stop_without_both_poses_is_named(both_poses, tmp_path):
     for stop in range(4):
         write_visp(tmp_path, stop, both_poses[0][stop], both_poses[1][stop])
     (tmp_path / "pose_cPo_2.yaml").unlink()
-    with pytest.raises(InputError, match="each stop needs both poses; incomplete: 2"):
+    with pytest.raises(
+        InputError, match="each stop needs both poses; incomplete: 2"
+    ):
         read_arm_samples(tmp_path)
 
 
@@ -265,7 +315,9 @@ def opencv_matrix(values):
     rows = np.atleast_2d(values)
     numbers = ", ".join(repr(float(value)) for value in rows.ravel())
     size = f"rows: {len(rows)}\n      cols: 3"
-    return f"!!opencv-matrix\n      {size}\n      dt: d\n      data: [{numbers}]"
+    return (
+        f"!!opencv-matrix\n      {size}\n      dt: d\n      data: [{numbers}]"
+    )
 
 
 def one_matrix(name, stack):
@@ -273,12 +325,15 @@ def one_matrix(name, stack):
 
 
 def a_matrix_for_each_stop(name, stack):
-    return f"{name}:\n" + "".join(f"   - {opencv_matrix(values)}\n" for values in stack)
+    return f"{name}:\n" + "".join(
+        f"   - {opencv_matrix(values)}\n" for values in stack
+    )
 
 
 def a_name_for_each_stop(name, stack):
     items = [
-        f"{name}_{stop}: {opencv_matrix(values)}\n" for stop, values in enumerate(stack)
+        f"{name}_{stop}: {opencv_matrix(values)}\n"
+        for stop, values in enumerate(stack)
     ]
     return "".join(items)
 
@@ -298,7 +353,8 @@ def test_arguments_of_opencv_in_a_file_storage(
             Ts[:, :3, 3],
         ]
     text = "".join(
-        write(name, stack) for name, stack in zip(ARGUMENTS, stacks, strict=True)
+        write(name, stack)
+        for name, stack in zip(ARGUMENTS, stacks, strict=True)
     )
     path = tmp_path / "samples.yaml"
     path.write_text(f"%YAML:1.0\n---\n{text}")

@@ -21,7 +21,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fleet_making import always_dies, dies_once, outcome, recordings_of
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose
 from result_making import good_calibration, written_finding
 
@@ -33,7 +39,13 @@ from hand_eye_calib.extras.fleet import batch as batch_run
 from hand_eye_calib.extras.fleet import work as batch_work
 from hand_eye_calib.extras.fleet.batch import write_rows
 from hand_eye_calib.extras.fleet.together import together
-from hand_eye_calib.extras.fleet.work import Outcome, Task, outcomes, tasks_of, work
+from hand_eye_calib.extras.fleet.work import (
+    Outcome,
+    Task,
+    outcomes,
+    tasks_of,
+    work,
+)
 from hand_eye_calib.formats import remote
 from hand_eye_calib.formats.bags.patterns import matching
 from hand_eye_calib.formats.bags.writer import write_bag
@@ -146,7 +158,10 @@ def test_a_batch_on_a_dask_cluster(run, fleet):
         reason="dask.distributed is not installed: pip install '.[cluster]'",
     )
     with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        dashboard_address=None,
     ) as cluster:
         assert_is_result_of_the_fleet(
             *run(*fleet, "--json", "--dask", cluster.scheduler_address)
@@ -163,18 +178,27 @@ def test_without_dask_its_option_says_what_to_install(run, fleet, monkeypatch):
 def test_a_defect_in_one_bag_leaves_the_others_alone(monkeypatch):
     monkeypatch.setattr(batch_work, "read_recording", lambda *_, **__: 1 / 0)
     outcome = work(Task(name="a", bags=("absent",)))
-    assert outcome.row["error"] == "unexpected ZeroDivisionError: division by zero"
+    assert (
+        outcome.row["error"] == "unexpected ZeroDivisionError: division by zero"
+    )
     assert "ZeroDivisionError" in json.loads(outcome.text)["traceback"]
 
 
 @pytest.mark.parametrize(
     ("severity", "code", "error"),
-    [(Severity.NOTE, 1, "the solver did not converge"), (Severity.ERROR, 3, None)],
+    [
+        (Severity.NOTE, 1, "the solver did not converge"),
+        (Severity.ERROR, 3, None),
+    ],
 )
 def test_a_recording_fails_as_it_does_alone(monkeypatch, severity, code, error):
     finding = written_finding("jumps", severity, "every step is a jump")
-    failed = good_calibration(status=SolveStatus.NOT_CONVERGED, findings=(finding,))
-    recording = types.SimpleNamespace(solved=lambda _: failed, inputs={}, snapshot=None)
+    failed = good_calibration(
+        status=SolveStatus.NOT_CONVERGED, findings=(finding,)
+    )
+    recording = types.SimpleNamespace(
+        solved=lambda _: failed, inputs={}, snapshot=None
+    )
     monkeypatch.setattr(batch_work, "read_recording", lambda *_: recording)
     outcome = work(Task(name="a", bags=("a",)))
     assert (outcome.code, outcome.row["error"]) == (code, error)
@@ -189,7 +213,10 @@ def test_a_recording_fails_as_it_does_alone(monkeypatch, severity, code, error):
             ["a/monday/bag", "b/monday/bag", "b/tuesday/bag"],
             ["a_monday", "b_monday", "b_tuesday"],
         ),
-        (["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"], ["t1", "t2"]),
+        (
+            ["s3://fleet/t1/run.mcap?sig=a/b", "s3://fleet/t2/run.mcap"],
+            ["t1", "t2"],
+        ),
         (["a/vehicles", "a/."], ["vehicles_2", "a"]),
     ],
 )
@@ -201,7 +228,10 @@ def test_recordings_are_named_by_what_tells_their_paths_apart(bags, names):
 
 
 def some_tasks(*names, **options):
-    return [Task(name=name, bags=(), options=options.get(name, {})) for name in names]
+    return [
+        Task(name=name, bags=(), options=options.get(name, {}))
+        for name in names
+    ]
 
 
 def done_by(tasks, work, **where):
@@ -235,7 +265,8 @@ def ended(pidfd, within_s=120):
 
 
 @pytest.mark.skipif(
-    not hasattr(os, "pidfd_open"), reason="processes are awaited by Linux's pidfd"
+    not hasattr(os, "pidfd_open"),
+    reason="processes are awaited by Linux's pidfd",
 )
 def test_no_worker_outlives_a_batch_that_is_killed(tmp_path):
     code = (
@@ -275,8 +306,15 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(
 ):
     more = ("--vehicle", "truck", "--no-report", "--jobs", "1")
     assert run(*fleet, *more, "--out", tmp_path / "1")[0] == 1
-    rows = list(csv.DictReader((tmp_path / "1" / "rows.csv").read_text().splitlines()))
-    assert [row["name"] for row in rows] == ["drive0", "drive1", "drive2", "gone"]
+    rows = list(
+        csv.DictReader((tmp_path / "1" / "rows.csv").read_text().splitlines())
+    )
+    assert [row["name"] for row in rows] == [
+        "drive0",
+        "drive1",
+        "drive2",
+        "gone",
+    ]
     assert rows[0]["start"] == "2023-11-14T22:13:20+00:00"
     assert (rows[3]["x_m"], rows[3]["error"][:10]) == ("", "no bag at ")
     assert_allclose(float(rows[0]["z_m"]), T_PARENT_CHILD[2, 3], atol=1e-3)
@@ -291,12 +329,16 @@ def test_rows_and_page_have_every_recording_and_the_vehicle(
 
 
 @pytest.mark.usefixtures("no_processes")
-def test_a_vehicle_whose_recordings_differ_is_no_good_exit(run, tmp_path, monkeypatch):
+def test_a_vehicle_whose_recordings_differ_is_no_good_exit(
+    run, tmp_path, monkeypatch
+):
     for number in range(2):
         write_drive(tmp_path / "bags" / f"drive{number}", 60, number)
 
     def differing(results):
-        return dataclasses.replace(good_calibration(), status=SolveStatus.NOT_CONVERGED)
+        return dataclasses.replace(
+            good_calibration(), status=SolveStatus.NOT_CONVERGED
+        )
 
     monkeypatch.setattr(batch_run, "together", differing)
     bags = [
@@ -323,11 +365,15 @@ def test_a_vehicle_with_one_recording_has_a_result_too(run, tmp_path):
     assert code == 0
     assert re.search(r"2 vehicles: 2 USE\b.*\na: USE.*\nb: USE", out)
     for vehicle in "ab":
-        assert (tmp_path / "out" / "vehicles" / vehicle / "extrinsic.yaml").exists()
+        assert (
+            tmp_path / "out" / "vehicles" / vehicle / "extrinsic.yaml"
+        ).exists()
 
 
 @pytest.mark.parametrize(("by", "code"), [(0.0, 0), (0.02, 4)])
-def test_recordings_of_a_vehicle_that_contradict_each_other_exit_as_moved(by, code):
+def test_recordings_of_a_vehicle_that_contradict_each_other_exit_as_moved(
+    by, code
+):
     outcomes = fleet_outcomes("a", 6, 1, shift=(4, 5), by=by)
     result = together({item.row["name"]: item.calibration for item in outcomes})
     assert batch_run._code_of_vehicle(result) == code
@@ -363,12 +409,16 @@ def outcomes_of(*bags):
 @pytest.fixture
 def memory(tmp_path):
     """A store with two bags in folders."""
-    fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed: '.[fleet]'")
+    fsspec = pytest.importorskip(
+        "fsspec", reason="fsspec is not installed: '.[fleet]'"
+    )
     store = fsspec.filesystem("memory")
     for number in range(2):
         write_drive(tmp_path / f"drive{number}", 60, number)
         store.put(
-            f"{tmp_path}/drive{number}/", f"/fleet/run{number}/drive", recursive=True
+            f"{tmp_path}/drive{number}/",
+            f"/fleet/run{number}/drive",
+            recursive=True,
         )
     yield store
     store.rm("/fleet", recursive=True)
@@ -408,7 +458,9 @@ def test_a_bag_at_a_url_is_replayed_alone(run, tmp_path, memory, monkeypatch):
 
 def test_a_remote_bag_may_not_fill_the_disk(tmp_path, memory, monkeypatch):
     monkeypatch.setattr(
-        remote.shutil, "disk_usage", lambda _: types.SimpleNamespace(free=20_000)
+        remote.shutil,
+        "disk_usage",
+        lambda _: types.SimpleNamespace(free=20_000),
     )
     _, (row,) = outcomes_of("memory://fleet/run0/drive")
     assert row["error"] == (
@@ -426,7 +478,9 @@ def test_what_a_store_calls_its_files_does_not_leave_the_folder(monkeypatch):
             copied.append(target)
 
     copied = []
-    monkeypatch.setattr(remote, "_reached", lambda url: nullcontext((Hostile(), "bag")))
+    monkeypatch.setattr(
+        remote, "_reached", lambda url: nullcontext((Hostile(), "bag"))
+    )
     with remote.local_copies(["s3://bag"]) as (paths, _):
         assert copied == [f"{paths[0]}/outside.mcap"]
 
@@ -444,7 +498,10 @@ def test_without_fsspec_one_line_says_what_to_install(tmp_path, monkeypatch):
     ("url", "shown"),
     [
         ("s3://fleet/run.mcap", "s3://fleet/run.mcap"),
-        ("https://user:pass@host/a@b.mcap?X-Signature=1", "https://host/a@b.mcap"),
+        (
+            "https://user:pass@host/a@b.mcap?X-Signature=1",
+            "https://host/a@b.mcap",
+        ),
         ("local/path?x", "local/path?x"),
     ],
 )
@@ -468,12 +525,18 @@ def fleet_outcomes(vehicle, count, seed, shift=(), by=0.02):
 def test_the_index_page_shows_each_vehicle(tmp_path):
     from hand_eye_calib.extras.fleet.batch_page import render_batch
 
-    outcomes = [*fleet_outcomes("<b>", 6, 1, shift=(4, 5)), *fleet_outcomes("a", 2, 2)]
+    outcomes = [
+        *fleet_outcomes("<b>", 6, 1, shift=(4, 5)),
+        *fleet_outcomes("a", 2, 2),
+    ]
     outcomes.append(Outcome.of(Task(name="lost", bags=()), "no <bag>"))
     rows = [outcome.row for outcome in outcomes]
     vehicles = {
         name: together(
-            {outcome.row["name"]: outcome.calibration for outcome in outcomes[members]}
+            {
+                outcome.row["name"]: outcome.calibration
+                for outcome in outcomes[members]
+            }
         )
         for name, members in (("<b>", slice(0, 6)), ("a", slice(6, 8)))
     }
@@ -497,15 +560,26 @@ def test_the_page_of_ten_thousand_recordings_stays_below_2_mb():
 
     (outcome,) = fleet_outcomes("truck_17", 1, 1)
     rows = [
-        {**outcome.row, "name": f"truck_017_2026-11-23T{n:05}"} for n in range(10_000)
+        {**outcome.row, "name": f"truck_017_2026-11-23T{n:05}"}
+        for n in range(10_000)
     ]
     page = render_batch("of/fleet/**", rows, {}, {row["name"] for row in rows})
-    assert len(page.encode()) < 1_790_000  # and 50 kB of each figure of 50 recordings
-    assert (len(rows_of(page)), page.count('<p class="muted">fleet: ')) == (10_000, 1)
+    assert (
+        len(page.encode()) < 1_790_000
+    )  # and 50 kB of each figure of 50 recordings
+    assert (len(rows_of(page)), page.count('<p class="muted">fleet: ')) == (
+        10_000,
+        1,
+    )
 
 
 def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
-    for place in ("truck_1/monday", "truck_1/tuesday", "truck_2/monday", "notes"):
+    for place in (
+        "truck_1/monday",
+        "truck_1/tuesday",
+        "truck_2/monday",
+        "notes",
+    ):
         (tmp_path / "fleet" / place).mkdir(parents=True, exist_ok=True)
         if place != "notes":
             (tmp_path / "fleet" / place / "metadata.yaml").touch()
@@ -516,16 +590,19 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
         f"{tmp_path}/fleet/truck_2/monday"
     ]
     assert [
-        (task.name, task.vehicle) for task in tasks_of(groups, "fleet/{vehicle}/*")
+        (task.name, task.vehicle)
+        for task in tasks_of(groups, "fleet/{vehicle}/*")
     ] == [
         ("truck_1_monday", "truck_1"),
         ("truck_1_tuesday", "truck_1"),
         ("truck_2_monday", "truck_2"),
     ]
-    assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {""}
-    assert {task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")} == {
+    assert {task.vehicle for task in tasks_of(groups, "other/{vehicle}/*")} == {
         ""
     }
+    assert {
+        task.vehicle for task in tasks_of([["/x/../bag"]], "/x/{vehicle}/bag")
+    } == {""}
     for path in ("none/**", "fleet/notes"):
         with pytest.raises(ConfigError, match="no bag matches"):
             matching(f"{tmp_path}/{path}")

@@ -7,7 +7,13 @@ from functools import cache, partial
 import browser
 import numpy as np
 import pytest
-from bag_making import ODOMETRY, POINTS, cloud_message, pose_message, write_messages
+from bag_making import (
+    ODOMETRY,
+    POINTS,
+    cloud_message,
+    pose_message,
+    write_messages,
+)
 from ground_making import YARD, Machine
 
 import hand_eye_calib as hec
@@ -38,7 +44,9 @@ def machine():
     return drive, clouds
 
 
-def write_bag(path, topics=("/a/points", "/b/points"), raised_m=0.0, storage="mcap"):
+def write_bag(
+    path, topics=("/a/points", "/b/points"), raised_m=0.0, storage="mcap"
+):
     """Write the bag of the machine; ``raised_m`` raises the points of the child."""
     drive, clouds = machine()
     messages = []
@@ -51,7 +59,9 @@ def write_bag(path, topics=("/a/points", "/b/points"), raised_m=0.0, storage="mc
     for topic, stream in streams:
         rows = se3.to_rows(stream.poses)
         for stamp_ns, row in zip(stream.stamps_ns.tolist(), rows, strict=True):
-            make = pose_message(ODOMETRY, stamp_ns, row, "odom", stream.sensor_frame)
+            make = pose_message(
+                ODOMETRY, stamp_ns, row, "odom", stream.sensor_frame
+            )
             messages.append((stamp_ns, topic, ODOMETRY, make))
     for topic, frame, scans, up_m in zip(
         ("/a/points", "/b/points"),
@@ -189,7 +199,8 @@ def test_the_installed_transform_is_before(recorded):
 def test_a_wrong_result_is_visible(recorded):
     _, result = recorded
     wrong = replace(
-        result, T_parent_child=result.T_parent_child @ se3.exp([0, 0, 0, 0, 0, 0.2])
+        result,
+        T_parent_child=result.T_parent_child @ se3.exp([0, 0, 0, 0, 0, 0.2]),
     )
     merged = merging.merge(wrong, result.recording)
     assert np.median(distances_from_walls(merged, merged.after, 0.7, 2.0)) > 0.2
@@ -197,7 +208,9 @@ def test_a_wrong_result_is_visible(recorded):
 
 def test_clouds_without_overlap_are_said_to_prove_nothing(tmp_path):
     path = write_bag(tmp_path / "bag", raised_m=30.0)
-    result = hec.calibrate(path, parent_topic="/a", child_topic="/b", ground="off")
+    result = hec.calibrate(
+        path, parent_topic="/a", child_topic="/b", ground="off"
+    )
     (figure,) = figures_of_clouds(result, result.recording)
     assert "proves nothing" in figure.caption
 
@@ -247,6 +260,8 @@ def test_only_the_wanted_span_of_a_bag_is_read(tmp_path, storage):
         span_ns = (bag.start_ns + 10_000_000_000, bag.start_ns + 12_500_000_000)
         (run,) = bag.runs(["/a/points"], span_ns)
         (everything,) = bag.runs(["/a/points"])
-    is_in_span = (everything.bag_ns >= span_ns[0]) & (everything.bag_ns < span_ns[1])
+    is_in_span = (everything.bag_ns >= span_ns[0]) & (
+        everything.bag_ns < span_ns[1]
+    )
     assert 0 < is_in_span.sum() < len(everything.bag_ns)
     assert run.bag_ns.tolist() == everything.bag_ns[is_in_span].tolist()

@@ -47,7 +47,9 @@ def with_child(pose_pairs, change):
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_an_error_of_the_result_is_linear_in_the_evidence(result, pose_pairs, axis):
+def test_an_error_of_the_result_is_linear_in_the_evidence(
+    result, pose_pairs, axis
+):
     xi = np.zeros(6)
     xi[axis] = 0.02
     wrong = result.T_parent_child @ se3.exp(xi)
@@ -119,7 +121,9 @@ def test_shifts_are_injected_when_read_or_sent(result, pose_pairs, monkeypatch):
 
 def test_no_size_is_below_what_sigma_makes_detectable(result, pose_pairs):
     """A method with a large sigma cannot have errors that a better method would contradict."""
-    wide = replace(result, covariance_measured=400.0 * result.covariance_measured)
+    wide = replace(
+        result, covariance_measured=400.0 * result.covariance_measured
+    )
     sizes = injection.detectability(wide, pose_pairs).errors
     least = 3.0 * np.hypot(2.0 * wide.sigmas_measured, wide.allowance)
     assert (np.array([*sizes.values()]) >= least).all()
@@ -134,7 +138,10 @@ def test_the_true_error_is_smaller(drive, result):
 def test_documents_contain_it(result):
     document = result.to_dict()
     assert document["detectability"]["errors"] == result.detectability.errors
-    assert hec.Calibration.from_dict(document).detectability == result.detectability
+    assert (
+        hec.Calibration.from_dict(document).detectability
+        == result.detectability
+    )
 
 
 def test_the_exchanged_result_has_none(result):
@@ -165,7 +172,9 @@ def flat_drive():
     X = se3.exp(np.array([0.4, -0.3, 0.2, 0.0, 0.0, 0.5]))
     random = np.random.default_rng(3)
     sigmas = np.repeat([0.003, 0.0005], 3)
-    parent_noise, child_noise = se3.exp(random.normal(size=(2, 900, 6)) * sigmas)
+    parent_noise, child_noise = se3.exp(
+        random.normal(size=(2, 900, 6)) * sigmas
+    )
     stamps_ns = (seconds * 1e9).astype(np.int64)
     parent = Trajectory(stamps_ns, Ts @ parent_noise)
     child = Trajectory(stamps_ns, Ts @ X @ child_noise)
@@ -184,7 +193,8 @@ def test_a_sigma_that_the_blocks_contradict_needs_care(result):
     wide = replace(
         result.detectability,
         errors={
-            axis: 100.0 * size for axis, size in result.detectability.errors.items()
+            axis: 100.0 * size
+            for axis, size in result.detectability.errors.items()
         },
     )
     (reason,) = result.with_part("detectability", wide).reasons
@@ -223,7 +233,10 @@ def test_sizes_that_are_unlimited_are_not_in_the_sentences(result):
     assert DetectabilityPart().facts(sizes, result) == []
     assert DetectabilityPart().facts(None, result) == []
     only_x = replace(
-        sizes, errors=unlimited | {"x": 0.0123}, time_offset_s=0.004, scale=np.inf
+        sizes,
+        errors=unlimited | {"x": 0.0123},
+        time_offset_s=0.004,
+        scale=np.inf,
     )
     (fact,) = DetectabilityPart().facts(only_x, result)
     assert "1.2 cm along x" in fact
@@ -232,9 +245,12 @@ def test_sizes_that_are_unlimited_are_not_in_the_sentences(result):
 
 def test_a_prior_is_no_reason_for_care(result):
     """A prior determines more than the motion can contradict."""
-    nothing_shows = replace(result.detectability, errors=dict.fromkeys(AXES, 1.0))
+    nothing_shows = replace(
+        result.detectability, errors=dict.fromkeys(AXES, 1.0)
+    )
     by_prior = [
-        replace(dof, verdict=DofVerdict.PRIOR) for dof in result.observability_measured
+        replace(dof, verdict=DofVerdict.PRIOR)
+        for dof in result.observability_measured
     ]
     with_prior = replace(result, observability_measured=tuple(by_prior))
     doubted = result.with_part("detectability", nothing_shows)

@@ -21,7 +21,10 @@ IMU = "sensor_msgs/msg/Imu"
 
 def tracks_of_lidars(drive, clouds):
     streams = (drive.parent, drive.child)
-    return [hec.ground_from_clouds(*both) for both in zip(clouds, streams, strict=True)]
+    return [
+        hec.ground_from_clouds(*both)
+        for both in zip(clouds, streams, strict=True)
+    ]
 
 
 def tracks_of_lidar_and_imu(drive, clouds):
@@ -43,7 +46,9 @@ def test_two_lidars_on_a_flat_yard_get_all_six_axes():
     assert errors[2] < Z_M
     assert errors[3:5].max() < TILT
     assert (errors < 3.3 * result.sigmas).all()
-    assert result.headline.endswith("roll, pitch and z are mostly from the ground")
+    assert result.headline.endswith(
+        "roll, pitch and z are mostly from the ground"
+    )
     assert [axis.name for axis in result.ground.axes] == ["roll", "pitch", "z"]
     assert not np.isfinite(result.ground.axes[2].motion_sigma)
 
@@ -83,7 +88,10 @@ def test_on_a_ramp_the_ground_agrees_with_the_motion():
 def test_attitudes_of_two_ins_give_roll_and_pitch():
     drive, _ = machine()
     streams = []
-    for T_base_sensor, frame in ((drive.T_base_parent, "a"), (drive.T_base_child, "b")):
+    for T_base_sensor, frame in (
+        (drive.T_base_parent, "a"),
+        (drive.T_base_child, "b"),
+    ):
         Ts = drive.Ts_world_base[::10] @ T_base_sensor
         streams.append(hec.Trajectory(drive.parent.stamps_ns, Ts, frame))
     verticals = [hec.gravity_from_attitude(stream) for stream in streams]
@@ -114,9 +122,9 @@ def test_a_loading_edge_beside_a_ramp_is_not_joined():
     on_edge = replace(child, heights_m=child.heights_m - 1.2)
     result = hec.calibrate_on_ground(drive.parent, drive.child, parent, on_edge)
     assert not result.ground.is_joined
-    assert [reason.axes for reason in result.reasons if reason.rule == "ground"] == [
-        ("z",)
-    ]
+    assert [
+        reason.axes for reason in result.reasons if reason.rule == "ground"
+    ] == [("z",)]
 
 
 def test_scans_of_a_loading_edge_are_outliers():
@@ -124,7 +132,9 @@ def test_scans_of_a_loading_edge_are_outliers():
     scans = []
     for number, (stamp_ns, points) in enumerate(clouds[1]):
         # A quarter of the scans see a platform, 0.6 m high.
-        scans.append((stamp_ns, np.add(points, [0.0, 0.0, 0.6 * (number % 4 == 0)])))
+        scans.append(
+            (stamp_ns, np.add(points, [0.0, 0.0, 0.6 * (number % 4 == 0)]))
+        )
     tracks = tracks_of_lidars(drive, (clouds[0], scans))
     result = hec.calibrate_on_ground(drive.parent, drive.child, *tracks)
     assert np.ptp(tracks[1].heights_m) > 0.5
@@ -160,7 +170,9 @@ def test_tall_grass_on_one_side_widens_sigma():
     assert grassy.bend_rad > 3 * child.bend_rad
     sigmas = []
     for track in (child, grassy):
-        result = hec.calibrate_on_ground(drive.parent, drive.child, parent, track)
+        result = hec.calibrate_on_ground(
+            drive.parent, drive.child, parent, track
+        )
         sigmas.append(result.ground.axes[0].ground_sigma)
         assert (errors_of(result, drive) < 3.3 * result.sigmas).all()
     assert sigmas[1] > 1.2 * sigmas[0]
@@ -169,9 +181,12 @@ def test_tall_grass_on_one_side_widens_sigma():
 def test_too_few_scans_with_ground_are_an_error():
     drive, clouds = machine()
     high = [
-        (stamp_ns, np.add(points, [0.0, 0.0, 30.0])) for stamp_ns, points in clouds[0]
+        (stamp_ns, np.add(points, [0.0, 0.0, 30.0]))
+        for stamp_ns, points in clouds[0]
     ]
-    with pytest.raises(NotEnoughDataError, match="0 of 70 scans contain the ground"):
+    with pytest.raises(
+        NotEnoughDataError, match="0 of 70 scans contain the ground"
+    ):
         hec.ground_from_clouds(high, drive.parent)
 
 
@@ -179,17 +194,25 @@ def test_accelerations_without_gravity_are_an_error():
     drive, _ = machine()
     stamps_ns, forces = drive.accelerations(drive.T_base_child)
     with pytest.raises(NotEnoughDataError, match="not that of gravity"):
-        hec.gravity_from_accelerations(stamps_ns, forces - [0, 0, 9.81], drive.child)
+        hec.gravity_from_accelerations(
+            stamps_ns, forces - [0, 0, 9.81], drive.child
+        )
     with pytest.raises(NotEnoughDataError, match="less than 15 s"):
-        hec.gravity_from_accelerations(stamps_ns[:100], forces[:100], drive.child)
+        hec.gravity_from_accelerations(
+            stamps_ns[:100], forces[:100], drive.child
+        )
 
 
 def test_a_real_imu_without_gravity_is_refused():
     bag = data_folder() / "bags" / "fuse" / "turtlebot3.bag"
     poses = hec.read_trajectory(bag, topic="/odom")
     with PoseBag(bag) as messages:
-        assert vertical_topics(messages) == {"/imu": ("gravity", "base_footprint")}
-        with pytest.raises(NotEnoughDataError, match="must not subtract gravity"):
+        assert vertical_topics(messages) == {
+            "/imu": ("gravity", "base_footprint")
+        }
+        with pytest.raises(
+            NotEnoughDataError, match="must not subtract gravity"
+        ):
             vertical_track(messages, "/imu", poses, "ground")
 
 

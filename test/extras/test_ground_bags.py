@@ -78,7 +78,9 @@ LAYOUTS = {
     "big-endian": (layout(["x", "y", "z"], [">f4"] * 3, [0, 4, 8], 12),),
     "float64": (layout(["x", "y", "z"], ["<f8"] * 3, [0, 8, 16], 24),),
     "unused bytes": (
-        layout(["x", "y", "z", "ring"], ["<f4"] * 3 + ["<u2"], [4, 8, 12, 20], 32),
+        layout(
+            ["x", "y", "z", "ring"], ["<f4"] * 3 + ["<u2"], [4, 8, 12, 20], 32
+        ),
     ),
     "z first": (layout(["z", "x", "y"], ["<f4"] * 3, [0, 8, 16], 22),),
 }
@@ -119,13 +121,19 @@ def from_above(drive, mount, rays):
 
 def directions_of(azimuths, elevations):
     level = np.cos(elevations)
-    columns = [level * np.cos(azimuths), level * np.sin(azimuths), np.sin(elevations)]
+    columns = [
+        level * np.cos(azimuths),
+        level * np.sin(azimuths),
+        np.sin(elevations),
+    ]
     return np.stack(columns, axis=1)
 
 
 def livox(rng):
     """A pattern that does not repeat and has no rings: 70 deg wide, 77 deg high."""
-    angles = rng.uniform(np.radians([-35, -38.5]), np.radians([35, 38.5]), (6000, 2))
+    angles = rng.uniform(
+        np.radians([-35, -38.5]), np.radians([35, 38.5]), (6000, 2)
+    )
     return directions_of(*angles.T)
 
 
@@ -140,9 +148,7 @@ def rings(count):
     return rays
 
 
-REFUSED = (
-    "scans contain the ground: it must be visible between 5 and 12 m, and the z axis"
-)
+REFUSED = "scans contain the ground: it must be visible between 5 and 12 m, and the z axis"
 # Rays, height of the lidar (m), whether it hangs upside down, and the message if it is refused.
 LIDARS = {
     "livox": (livox, 1.4, False, ""),
@@ -163,7 +169,9 @@ def test_lidars_of_all_kinds_are_right_or_refused(name):
     )
     if is_upside_down:
         mount[:3, :3] = mount[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    poses = hec.Trajectory(drive.parent.stamps_ns, drive.Ts_world_base[::10] @ mount)
+    poses = hec.Trajectory(
+        drive.parent.stamps_ns, drive.Ts_world_base[::10] @ mount
+    )
     clouds = from_above(drive, mount, rays)
     if message:
         with pytest.raises(NotEnoughDataError, match=message):
@@ -183,7 +191,9 @@ def test_empty_clouds_are_scans_without_ground():
     ]
     track = hec.ground_from_clouds(some, drive.parent)
     assert len(track) == 56
-    with pytest.raises(NotEnoughDataError, match="0 of 70 scans contain the ground"):
+    with pytest.raises(
+        NotEnoughDataError, match="0 of 70 scans contain the ground"
+    ):
         hec.ground_from_clouds(
             [(stamp_ns, points[:0]) for stamp_ns, points in some], drive.parent
         )
@@ -225,7 +235,9 @@ def imu_message(typestore, stamp_ns, force, frame):
 def odometry_messages(trajectory, topic):
     rows = se3.to_rows(trajectory.poses)
     for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
-        message = pose_message(ODOMETRY, stamp_ns, row, "odom", trajectory.sensor_frame)
+        message = pose_message(
+            ODOMETRY, stamp_ns, row, "odom", trajectory.sensor_frame
+        )
         yield stamp_ns, topic, ODOMETRY, message
 
 
@@ -248,13 +260,18 @@ def write_drive(path, child_frame="rear", with_imu=False, names="xyz"):
                 stamps_ns[::4].tolist(), forces[::4], strict=True
             ):
                 make = partial(
-                    imu_message, stamp_ns=stamp_ns, force=force, frame=child_frame
+                    imu_message,
+                    stamp_ns=stamp_ns,
+                    force=force,
+                    frame=child_frame,
                 )
                 messages.append((stamp_ns, "/b/imu", IMU, make))
             continue
         frame = child_frame if frame == "rear" else frame
         for stamp_ns, points in scans:
-            make = partial(cloud_message, stamp_ns=stamp_ns, points=points, frame=frame)
+            make = partial(
+                cloud_message, stamp_ns=stamp_ns, points=points, frame=frame
+            )
             make = partial(make, names=names)
             messages.append((stamp_ns, topic, POINTS, make))
     write_messages(path, messages)
@@ -270,7 +287,9 @@ def calibrated(folder, bag, capsys, *options):
 
 
 @pytest.mark.parametrize("with_imu", [False, True])
-def test_a_bag_uses_the_ground_by_itself(tmp_path, capsys, no_figures, with_imu):
+def test_a_bag_uses_the_ground_by_itself(
+    tmp_path, capsys, no_figures, with_imu
+):
     drive = write_drive(tmp_path / "bag", with_imu=with_imu)
     _, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
     second = "gravity from /b/imu" if with_imu else "ground from /b/points"
@@ -302,10 +321,15 @@ def test_clouds_that_cannot_be_read_are_a_note(tmp_path, capsys, no_figures):
     write_drive(tmp_path / "bag", names="abc")
     code, result, printed = calibrated(tmp_path, tmp_path / "bag", capsys)
     assert (code, result.ground) == (3, None)
-    assert "not used: /a/points: points have no x, y, z, but a, b, c" in printed.err
+    assert (
+        "not used: /a/points: points have no x, y, z, but a, b, c"
+        in printed.err
+    )
 
 
-def test_pairs_of_a_rig_read_the_ground_of_the_first_sensor_once(tmp_path, monkeypatch):
+def test_pairs_of_a_rig_read_the_ground_of_the_first_sensor_once(
+    tmp_path, monkeypatch
+):
     drive = write_drive(tmp_path / "bag")
     reads = []
 
@@ -372,13 +396,24 @@ def by_recordings(bag, out, ground):
 
 
 def by_rig(bag, out, ground):
-    arguments = ["--topics", "/a", "/b", "/c", "--out", str(out), "--ground", ground]
+    arguments = [
+        "--topics",
+        "/a",
+        "/b",
+        "/c",
+        "--out",
+        str(out),
+        "--ground",
+        ground,
+    ]
     main(["rig", str(bag), *arguments])
     return hec.load(out / "rear")
 
 
 def by_python(bag, out, ground):
-    return hec.calibrate(bag, parent_topic="/a", child_topic="/b", ground=ground)
+    return hec.calibrate(
+        bag, parent_topic="/a", child_topic="/b", ground=ground
+    )
 
 
 INTERFACES = {
@@ -413,7 +448,9 @@ def test_python_names_what_it_uses(bag_of_lidars):
     with pytest.warns(
         UserWarning, match="ground from /a/points and ground from /b/points are"
     ):
-        hec.calibrate(bag_of_lidars, parent_topic="/a", child_topic="/b", checks=False)
+        hec.calibrate(
+            bag_of_lidars, parent_topic="/a", child_topic="/b", checks=False
+        )
 
 
 @pytest.mark.parametrize(
@@ -431,7 +468,10 @@ def test_python_refuses_the_ground_of_trajectories(ground, child, message):
 def test_the_list_names_ground_and_gravity(tmp_path, capsys):
     write_drive(tmp_path / "bag", with_imu=True)
     main(["calibrate", str(tmp_path / "bag"), "--list", "--json"])
-    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["topics"]}
+    rows = {
+        row["name"]: row
+        for row in json.loads(capsys.readouterr().out)["topics"]
+    }
     assert rows["/a"]["measures"] == ""
     assert (rows["/a/points"]["measures"], rows["/a/points"]["frames"]) == (
         "ground",

@@ -28,7 +28,9 @@ WORLD = se3.exp(np.array([50.0, -20.0, 3.0, 0.1, -0.2, 2.0]))
 
 def antenna_of(poses, noise_m, seed=5):
     """Positions of the antenna in another world."""
-    positions = (WORLD @ poses)[:, :3, :3] @ LEVER_ARM + (WORLD @ poses)[:, :3, 3]
+    positions = (WORLD @ poses)[:, :3, :3] @ LEVER_ARM + (WORLD @ poses)[
+        :, :3, 3
+    ]
     return positions + noise_m * np.random.default_rng(seed).standard_normal(
         positions.shape
     )
@@ -39,7 +41,8 @@ def recorded(n_poses=300, noise_m=0.005, drift_rad=2e-4, seed=2, poses=None):
     poses = wandering_poses(n_poses, seed) if poses is None else poses
     random = np.random.default_rng(seed)
     drift = np.c_[
-        np.zeros((len(poses), 3)), drift_rad * random.normal(size=(len(poses), 3))
+        np.zeros((len(poses), 3)),
+        drift_rad * random.normal(size=(len(poses), 3)),
     ]
     motions = se3.inverse(poses[:-1]) @ poses[1:] @ se3.exp(drift[1:])
     stamps_ns = START_NS + STEP_NS * np.arange(len(poses))
@@ -61,12 +64,16 @@ def result(streams):
 
 def distances(result):
     """Errors over their standard deviations."""
-    return (result.T_parent_child[:3, 3] - LEVER_ARM) / result.sigmas_measured[:3]
+    return (result.T_parent_child[:3, 3] - LEVER_ARM) / result.sigmas_measured[
+        :3
+    ]
 
 
 class TestLeverArm:
     def test_it_is_found_within_its_sigma(self, result):
-        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+        assert result.T_parent_child[:3, 3] == pytest.approx(
+            LEVER_ARM, abs=0.01
+        )
         assert np.abs(distances(result)).max() < 4.0
         assert result.sigmas_measured[:3].max() < 0.005
         assert abs(result.time_offset_s) < 0.005
@@ -99,13 +106,17 @@ class TestLeverArm:
         )
 
     def test_another_clock_is_found_from_the_speeds(self):
-        parent, child = recorded(poses=wandering_poses(400, seed=4, step_rad=0.02))
+        parent, child = recorded(
+            poses=wandering_poses(400, seed=4, step_rad=0.02)
+        )
         shifted = hec.calibrate(parent, child.shifted(-7.31))
         assert 'solved with time_offset="estimate"' in shifted.warnings[0]
         assert shifted.time_offset_s == pytest.approx(7.31, abs=0.01)
         assert np.abs(distances(shifted)).max() < 4.0
 
-    def test_a_drone_whose_positions_are_smoothed_knows_its_height_no_better(self):
+    def test_a_drone_whose_positions_are_smoothed_knows_its_height_no_better(
+        self,
+    ):
         """It tilts to accelerate, so that 5 mm per m/s^2 look like 49 mm of height."""
         times_s = STEP_NS * 1e-9 * np.arange(1200)
         random = np.random.default_rng(3)
@@ -113,7 +124,9 @@ class TestLeverArm:
         path = 4.0 * np.sin(away_rad) * [1.0, 1.0, 0.0]
         pulls = -np.square([0.6, 0.6 * 1.37, 0.0]) * path
         tilt = (
-            np.stack([-pulls[:, 1], pulls[:, 0], 3.0 * np.sin(0.1 * times_s)], axis=1)
+            np.stack(
+                [-pulls[:, 1], pulls[:, 0], 3.0 * np.sin(0.1 * times_s)], axis=1
+            )
             / 9.81
         )
         truth = se3.from_rotation_translation(se3.rotation_exp(tilt), path)
@@ -121,7 +134,9 @@ class TestLeverArm:
         antenna = antenna_of(truth, 0.0)
         bent = np.gradient(np.gradient(antenna, 0.1, axis=0), 0.1, axis=0)
         positions = (
-            antenna + 0.005 * bent + 0.003 * random.standard_normal(antenna.shape)
+            antenna
+            + 0.005 * bent
+            + 0.003 * random.standard_normal(antenna.shape)
         )
         noise = 0.001 * random.standard_normal((len(truth), 6))
         smoothed = hec.calibrate(
@@ -146,23 +161,32 @@ class TestLeverArm:
         monkeypatch.setattr(positions, "solve", solve)
         parent, child = recorded()
         result = hec.calibrate(parent, child.scaled(1 / 1.02), checks=False)
-        (scale,) = (finding for finding in result.findings if finding.code == "scale")
+        (scale,) = (
+            finding for finding in result.findings if finding.code == "scale"
+        )
         assert scale.evidence["scale"] == pytest.approx(1.02, abs=0.001)
 
     def test_a_scale_is_within_its_sigma_whatever_the_worlds(self):
         parent, child = recorded(drift_rad=1e-3, noise_m=0.02, seed=1)
-        small = Trajectory(parent.stamps_ns, parent.scaled(0.97).poses, "camera")
-        result = hec.calibrate(small, child, scale="estimate", target_axes="z=5cm")
+        small = Trajectory(
+            parent.stamps_ns, parent.scaled(0.97).poses, "camera"
+        )
+        result = hec.calibrate(
+            small, child, scale="estimate", target_axes="z=5cm"
+        )
         assert result.target_axes == {"z": 0.05}
         assert abs(result.scale - 0.97) < 4.0 * result.scale_sigma < 0.01
-        assert result.T_parent_child[:3, 3] == pytest.approx(0.97 * LEVER_ARM, abs=0.02)
+        assert result.T_parent_child[:3, 3] == pytest.approx(
+            0.97 * LEVER_ARM, abs=0.02
+        )
 
     def test_a_drift_with_the_path_is_within_sigma(self):
         parent, child, lever_arm = simulated_positions("car", seed=3)
         result = hec.calibrate(parent, child, checks=False)
         assert (
             np.abs(
-                (result.T_parent_child[:3, 3] - lever_arm) / result.sigmas_measured[:3]
+                (result.T_parent_child[:3, 3] - lever_arm)
+                / result.sigmas_measured[:3]
             ).max()
             < 4.0
         )
@@ -202,11 +226,15 @@ class TestLeverArm:
             child.stamps_ns[kept], positions[kept], "antenna"
         )
         result = hec.calibrate(parent, worse)
-        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.03)
+        assert result.T_parent_child[:3, 3] == pytest.approx(
+            LEVER_ARM, abs=0.03
+        )
         assert np.abs(distances(result)).max() < 4.0
 
     @pytest.mark.parametrize("tilt_rad", [0.0, 0.004])
-    def test_on_flat_ground_height_is_unobservable_whatever_the_noise(self, tilt_rad):
+    def test_on_flat_ground_height_is_unobservable_whatever_the_noise(
+        self, tilt_rad
+    ):
         parent, child = recorded(drift_rad=0.0, poses=planar_poses(400, seed=3))
         tilt = tilt_rad * np.random.default_rng(0).normal(size=(400, 3))
         noisy = parent.poses @ se3.exp(np.c_[np.zeros((400, 3)), tilt])
@@ -214,7 +242,10 @@ class TestLeverArm:
         result = hec.calibrate(parent, child)
         assert result.unobservable() == ["z", "roll", "pitch", "yaw"]
         assert result.status is hec.SolveStatus.UNOBSERVABLE
-        assert "z cannot be determined from this motion" in result.reasons[0].sentence
+        assert (
+            "z cannot be determined from this motion"
+            in result.reasons[0].sentence
+        )
         assert np.abs(distances(result)[:2]).max() < 4.0
         with_prior = hec.calibrate(
             parent, child, prior={"z": (1.2, 0.01)}, checks=False
@@ -228,7 +259,9 @@ class TestLeverArm:
     @pytest.mark.parametrize(
         ("kind", "travel_s"), [("odometry", 0.005), ("exact", 0.0)]
     )
-    def test_the_allowance_grows_with_the_speed_of_an_odometry(self, kind, travel_s):
+    def test_the_allowance_grows_with_the_speed_of_an_odometry(
+        self, kind, travel_s
+    ):
         parent, child, _ = simulated_positions("car", seed=4)
         result = hec.calibrate(parent, child, parent_kind=kind, checks=False)
         speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
@@ -244,7 +277,9 @@ class TestLeverArm:
         parent, child = streams
         result = hec.calibrate(parent, child.scaled(1000.0))
         assert "millimetres" in result.warnings[0]
-        assert result.T_parent_child[:3, 3] == pytest.approx(LEVER_ARM, abs=0.01)
+        assert result.T_parent_child[:3, 3] == pytest.approx(
+            LEVER_ARM, abs=0.01
+        )
         assert result.verdict is not hec.Verdict.DO_NOT_USE
 
     def test_longitudes_without_the_cosine_of_the_latitude_are_not_used_in_silence(
@@ -256,7 +291,8 @@ class TestLeverArm:
             wide = Trajectory.from_positions(antenna.stamps_ns, positions)
             result = hec.calibrate(odometry, wide)
             assert ("unrelated", severity) in [
-                (finding.code, finding.severity.value) for finding in result.findings
+                (finding.code, finding.severity.value)
+                for finding in result.findings
             ]
             assert result.verdict is hec.Verdict.DO_NOT_USE
 
@@ -269,14 +305,19 @@ class TestLeverArm:
 
         assert codes(parent, child.scaled(1000.0)) == ["units"]
         assert codes(parent, recorded(n_poses=320, seed=8)[1]) == ["unrelated"]
-        two = child.poses[:, :3, 3] + [0.5, 0.0, 0.0] * (np.arange(320) % 2)[:, None]
+        two = (
+            child.poses[:, :3, 3]
+            + [0.5, 0.0, 0.0] * (np.arange(320) % 2)[:, None]
+        )
         both = Trajectory.from_positions(child.stamps_ns, two)
         assert codes(parent, both) == ["interleaved", "unrelated"]
         north_east = Trajectory.from_positions(
             child.stamps_ns, child.poses[:, [1, 0, 2], 3]
         )
         assert codes(parent, north_east) == ["unrelated", "left_handed"]
-        from_pole_to_pole = [0.0, 0.0, 6.4e6] * (-1.0) ** np.arange(320)[:, None]
+        from_pole_to_pole = [0.0, 0.0, 6.4e6] * (-1.0) ** np.arange(320)[
+            :, None
+        ]
         poles = Trajectory.from_positions(child.stamps_ns, from_pole_to_pole)
         assert "unrelated" in codes(parent, poles)
         kept = np.r_[0:30, 60:80]
@@ -288,7 +329,9 @@ class TestLeverArm:
         assert codes(*flat) == ["unchecked", "one_axis"]
 
 
-def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, capsys):
+def test_the_command_with_latitude_and_longitude(
+    streams, result, tmp_path, capsys
+):
     parent, child = streams
     lat, lon, height = geodetic(child.poses[:, :3, 3], (60.0, 25.0, 40.0))
     places = zip(child.stamps_ns.tolist(), lat, lon, height, strict=True)
@@ -297,7 +340,9 @@ def test_the_command_with_latitude_and_longitude(streams, result, tmp_path, caps
     (tmp_path / "gnss.csv").write_text(
         "\n".join(["t_ns,latitude,longitude,altitude", *rows])
     )
-    code = main(["calibrate", str(tmp_path / "lidar.tum"), str(tmp_path / "gnss.csv")])
+    code = main(
+        ["calibrate", str(tmp_path / "lidar.tum"), str(tmp_path / "gnss.csv")]
+    )
     printed = capsys.readouterr()
     assert code == 0
     assert "roll, pitch and yaw are not estimated" in printed.out

@@ -14,7 +14,12 @@ SECOND_NS = 1_000_000_000
 
 
 def motion(
-    duration_s, seed=0, flat=False, sigma=(0.003, 0.002), start_s=0.0, rate_hz=10.0
+    duration_s,
+    seed=0,
+    flat=False,
+    sigma=(0.003, 0.002),
+    start_s=0.0,
+    rate_hz=10.0,
 ):
     """Pose pairs with white errors, that turn about all axes or about z only."""
     n_poses = round(duration_s * rate_hz)
@@ -139,7 +144,9 @@ def test_standing_still_and_gaps_add_nothing():
     # The worlds may be others after a gap.
     world = se3.exp(np.array([5.0, 2.0, 1.0, 0.3, 0.2, 1.0]))
     later = motion(200.0, 2, start_s=5000.0)
-    monitor.add(PosePairs(later.stamps_ns, world @ later.Ts_pw_p, later.Ts_cw_c))
+    monitor.add(
+        PosePairs(later.stamps_ns, world @ later.Ts_pw_p, later.Ts_cw_c)
+    )
     assert monitor.alarm is None
     # A clock that was reset.
     before = monitor.seconds

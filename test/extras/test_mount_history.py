@@ -13,7 +13,11 @@ from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.extras.mount.compare import compare_digests
-from hand_eye_calib.extras.mount.digest import read_digest, read_digests, write_digest
+from hand_eye_calib.extras.mount.digest import (
+    read_digest,
+    read_digests,
+    write_digest,
+)
 from hand_eye_calib.extras.mount.history import History, find_changes
 from hand_eye_calib.extras.mount.monitor import MountMonitor
 
@@ -79,7 +83,11 @@ def weeks(session, seed, shift=None, since=60, n_weeks=100):
         S = H @ offset + root @ rng.normal(size=6)
         start_ns = START_NS + week * WEEK_NS
         evidence = np.concatenate([H, S[:, None]], axis=1)
-        changes = {"start_ns": start_ns, "end_ns": start_ns, "evidence": evidence}
+        changes = {
+            "start_ns": start_ns,
+            "end_ns": start_ns,
+            "evidence": evidence,
+        }
         digests.append(dataclasses.replace(session, **changes))
     return digests
 
@@ -93,7 +101,9 @@ def about_parent(axis, degrees):
 
 def arguments(*paths, json=False, installed=None, fleet=None):
     results = [str(path) for path in paths]
-    return SimpleNamespace(results=results, json=json, installed=installed, fleet=fleet)
+    return SimpleNamespace(
+        results=results, json=json, installed=installed, fleet=fleet
+    )
 
 
 def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
@@ -111,15 +121,21 @@ def test_a_digest_is_small_and_read_as_it_was_written(session, tmp_path):
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
-def test_a_shift_of_300_mdeg_in_week_60_is_found_within_three_sessions(session, axis):
+def test_a_shift_of_300_mdeg_in_week_60_is_found_within_three_sessions(
+    session, axis
+):
     for seed in range(7):
         digests = weeks(session, 100 + seed, about_parent(axis, 0.3))
         first = next(n for n in range(1, 101) if find_changes(digests[:n]))
         assert 60 < first <= 63, (axis, seed, first)
         changes = find_changes(digests)
         assert [changepoint.index for changepoint in changes] == [60]
-        row = changes[0].shift.axes[{"x": "roll", "y": "pitch", "z": "yaw"}[axis]]
-        assert row.difference == pytest.approx(np.radians(0.3), abs=3.3 * row.sigma)
+        row = changes[0].shift.axes[
+            {"x": "roll", "y": "pitch", "z": "yaw"}[axis]
+        ]
+        assert row.difference == pytest.approx(
+            np.radians(0.3), abs=3.3 * row.sigma
+        )
 
 
 def test_no_false_alarm_in_20_histories_of_100_weeks(session):
@@ -135,7 +151,9 @@ def test_sessions_of_the_monitor_itself_show_when_the_mount_moved():
         monitor = MountMonitor(MOUNT, np.zeros((6, 6)))
         monitor.add(forklift(400.0, seed=10 + week, mount=mount))
         digest = monitor.digest("lidar", "camera")
-        digests.append(dataclasses.replace(digest, start_ns=START_NS + week * WEEK_NS))
+        digests.append(
+            dataclasses.replace(digest, start_ns=START_NS + week * WEEK_NS)
+        )
     assert find_changes(digests[:4]) == []
     (changepoint,) = find_changes(digests)
     assert changepoint.index == 4
@@ -148,11 +166,16 @@ def test_two_changes_are_found(session):
     digests = weeks(session, 3, about_parent("z", 0.5), since=30, n_weeks=60)
     back = weeks(session, 3, None, n_weeks=60)
     digests[45:] = back[45:]
-    assert [changepoint.index for changepoint in find_changes(digests)] == [30, 45]
+    assert [changepoint.index for changepoint in find_changes(digests)] == [
+        30,
+        45,
+    ]
 
 
 def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
-    for digest in weeks(session, 5, about_parent("z", 0.5), since=6, n_weeks=10):
+    for digest in weeks(
+        session, 5, about_parent("z", 0.5), since=6, n_weeks=10
+    ):
         write_digest(tmp_path, digest)
     code = compare_digests(arguments(tmp_path))
     lines = capsys.readouterr().out.splitlines()
@@ -161,12 +184,17 @@ def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
         "Mount of camera on lidar: moved before 2023-12-26 22:13: "
     )
     assert "(10 sessions)" in lines[0]
-    assert len([line for line in lines if line.startswith("  -- moved before")]) == 1
+    assert (
+        len([line for line in lines if line.startswith("  -- moved before")])
+        == 1
+    )
     assert len(lines) == 1 + 1 + 10 + 1
     assert compare_digests(arguments(tmp_path, json=True)) == 4
     document = json.loads(capsys.readouterr().out)
     assert len(document["sessions"]) == 10
-    assert [change["session"] for change in document["changes"]] == ["2023-12-26 22:13"]
+    assert [change["session"] for change in document["changes"]] == [
+        "2023-12-26 22:13"
+    ]
     with pytest.raises(ConfigError, match="omit --with"):
         compare_digests(arguments(tmp_path, installed="robot.urdf"))
 
@@ -182,7 +210,10 @@ def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(
         write_digest(tmp_path, digest)
     assert compare_digests(arguments(tmp_path)) == 4
     lines = capsys.readouterr().out.splitlines()
-    assert f"alarm in the session of {last.day}: moved about z by 1.5 deg" in lines[0]
+    assert (
+        f"alarm in the session of {last.day}: moved about z by 1.5 deg"
+        in lines[0]
+    )
     assert lines[-2:] == [
         "  -- alarm in this session: moved about z by 1.5 deg",
         "     (the offset above is of the whole session, also before the alarm)",
@@ -231,13 +262,20 @@ def write_fleet(session, folder):
     return [folder / vehicle for vehicle in shifts]
 
 
-def test_the_page_of_a_fleet_has_the_history_of_each_vehicle(session, tmp_path, capsys):
+def test_the_page_of_a_fleet_has_the_history_of_each_vehicle(
+    session, tmp_path, capsys
+):
     vehicles = write_fleet(session, tmp_path)
     page = tmp_path / "fleet.html"
     assert compare_digests(arguments(*vehicles, fleet=page)) == 4
-    moved_week = dataclasses.replace(session, start_ns=START_NS + 60 * WEEK_NS).day
+    moved_week = dataclasses.replace(
+        session, start_ns=START_NS + 60 * WEEK_NS
+    ).day
     first, second, third = capsys.readouterr().out.splitlines()
-    assert first == "forklift_1: Mount of camera on lidar: no change in 100 sessions"
+    assert (
+        first
+        == "forklift_1: Mount of camera on lidar: no change in 100 sessions"
+    )
     assert f"moved before {moved_week}" in second
     assert "alarm in the session of" in third
     html = page.read_text()
@@ -268,7 +306,9 @@ def test_a_page_of_a_fleet_needs_digests_of_every_vehicle(session, tmp_path):
         ConfigError, match="--fleet needs digests.*b has none: the node writes"
     ):
         compare_digests(
-            arguments(tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html")
+            arguments(
+                tmp_path / "a", tmp_path / "b", fleet=tmp_path / "page.html"
+            )
         )
     assert not (tmp_path / "page.html").exists()
     with pytest.raises(ConfigError, match="no digests: .*digests has none"):

@@ -95,7 +95,9 @@ def test_a_delay_of_positions_is_estimated(platform):
 
 def test_a_delay_is_estimated_although_a_lever_arm_hides_it_in_the_speeds():
     recording = part_faults.positions("hand", "delayed 150 ms", 831500)
-    result = hec.calibrate(recording.parent, recording.child, **part_faults.WIDE)
+    result = hec.calibrate(
+        recording.parent, recording.child, **part_faults.WIDE
+    )
     assert result.findings == ()
     assert result.time_offset_s == pytest.approx(-0.15, abs=0.005)
 
@@ -117,13 +119,17 @@ def test_the_posterior_of_smoothing_lies_between_zero_and_the_estimate():
     # Without information, the variance is that of the prior: 80 % of 2e-3, 20 % of 1e-2.
     prior_s4 = 0.8 * 0.002**2 + 0.2 * 0.01**2
     assert vague.variance_s4 == pytest.approx(prior_s4, rel=0.05)
-    assert posterior_smoothing(-0.02, 0.001).mean_s2 == pytest.approx(-clear.mean_s2)
+    assert posterior_smoothing(-0.02, 0.001).mean_s2 == pytest.approx(
+        -clear.mean_s2
+    )
 
 
 def test_smoothing_that_is_too_weak_for_a_finding_is_removed_from_the_lever_arm():
     recording = part_faults.positions("drone_slam", "clean", SEED)
     path = recording.child.poses[:, :3, 3]
-    smoothed = gaussian_filter1d(path, 2.0, axis=0, mode="nearest")  # 0.1 s, 5e-3 s^2
+    smoothed = gaussian_filter1d(
+        path, 2.0, axis=0, mode="nearest"
+    )  # 0.1 s, 5e-3 s^2
     child = Trajectory.from_positions(
         recording.child.stamps_ns, smoothed, "antenna", "map"
     )
@@ -131,7 +137,9 @@ def test_smoothing_that_is_too_weak_for_a_finding_is_removed_from_the_lever_arm(
     assert codes(result) == []
     assert part_faults.largest_ratio("positions", result, recording.truth) < 2.5
     # The smoothing shifts the lever arm along z by 5 cm.
-    assert result.T_parent_child[2, 3] == pytest.approx(recording.truth[2], abs=0.03)
+    assert result.T_parent_child[2, 3] == pytest.approx(
+        recording.truth[2], abs=0.03
+    )
 
 
 # Faults of rates and rotations, and the code of the finding on machines that move in other ways.
@@ -237,7 +245,9 @@ def test_auto_leaves_a_scale_that_is_one():
 def test_parallel_axes_and_an_antenna_at_the_origin_may_be_said_by_priors():
     rates = part_faults.rates("drone", "own rates", SEED)
     priors = {axis: (0.0, np.radians(2.0)) for axis in ("roll", "pitch", "yaw")}
-    result = hec.calibrate(rates.parent, rates.child, prior=priors, **part_faults.WIDE)
+    result = hec.calibrate(
+        rates.parent, rates.child, prior=priors, **part_faults.WIDE
+    )
     assert codes(result) == []
     positions = part_faults.positions("drone", "copied with noise", SEED)
     here = dict.fromkeys("xyz", (0.0, 0.02))
@@ -259,7 +269,9 @@ def test_orientations_alone_of_the_parent_itself_are_named(
     turned_rad, noise_rad, code, severity
 ):
     parent = part_faults.rates("drone", "clean", SEED).parent
-    noise = noise_rad * np.random.default_rng(2).standard_normal((len(parent), 3))
+    noise = noise_rad * np.random.default_rng(2).standard_normal(
+        (len(parent), 3)
+    )
     turns = se3.rotation_exp(noise) @ se3.rotation_exp([0.0, turned_rad, 0.0])
     poses = parent.poses @ se3.from_rotation_translation(turns, np.zeros(3))
     own = dataclasses.replace(
@@ -276,14 +288,18 @@ def test_rotations_about_one_axis_are_not_mirrored_by_the_noise_of_the_others():
     yaw = 0.8 * np.sin(0.05 * np.arange(1200))
     noise = 0.002 * random.standard_normal((1200, 3))
     turns = se3.rotation_exp(np.column_stack([noise[:, :2], yaw]))
-    opposite = se3.rotation_exp(np.column_stack([noise[:, 0], -noise[:, 1], yaw]))
+    opposite = se3.rotation_exp(
+        np.column_stack([noise[:, 0], -noise[:, 1], yaw])
+    )
     parent = Trajectory(
         stamps_ns, se3.from_rotation_translation(turns, np.zeros(3)), "ins"
     )
     child = Trajectory(
         stamps_ns, se3.from_rotation_translation(opposite, np.zeros(3)), "imu"
     )
-    result = hec.calibrate(parent, dataclasses.replace(child, measures="rotations"))
+    result = hec.calibrate(
+        parent, dataclasses.replace(child, measures="rotations")
+    )
     assert "left_handed" not in codes(result)
 
 
@@ -302,11 +318,15 @@ def test_positions_of_a_short_recording_do_not_end_in_a_traceback():
 def test_rates_on_a_flat_floor_are_good_to_the_usual_misalignment():
     """About one axis, a misaligned gyroscope looks like a turned one: 0.5 deg is usual."""
     drive = classes.make("flat_agv", 931)
-    steps = se3.log(se3.inverse(drive.child.poses[:-1]) @ drive.child.poses[1:])[:, 3:]
+    steps = se3.log(
+        se3.inverse(drive.child.poses[:-1]) @ drive.child.poses[1:]
+    )[:, 3:]
     stamps_ns = drive.child.stamps_ns
     rates = steps / (np.diff(stamps_ns)[:, None] * 1e-9)
     rates += 0.001 * np.random.default_rng(SEED).standard_normal(rates.shape)
     middles_ns = (stamps_ns[:-1] + stamps_ns[1:]) // 2
-    result = hec.calibrate(drive.parent, Trajectory.from_rates(middles_ns, rates))
+    result = hec.calibrate(
+        drive.parent, Trajectory.from_rates(middles_ns, rates)
+    )
     assert 0.3 < np.degrees(result.sigmas[3]) < 3.0
     assert not np.isfinite(result.sigmas[5])

@@ -126,7 +126,9 @@ class TestRates:
         assert result.rate_bias is None
         assert angle_to(T_PARENT_CHILD[:3, :3], result) < np.radians(0.1)
 
-    def test_about_a_single_axis_the_angle_around_it_is_unobservable(self, streams):
+    def test_about_a_single_axis_the_angle_around_it_is_unobservable(
+        self, streams
+    ):
         poses = planar_poses(400, seed=2)
         stamps_ns = START_NS + STEP_NS * np.arange(400)
         noise = 1e-3 * np.random.default_rng(0).normal(size=(2, 400, 6))
@@ -137,12 +139,17 @@ class TestRates:
         result = hec.calibrate(parent, child)
         assert result.unobservable() == ["x", "y", "z", "yaw"]
         assert result.status is hec.SolveStatus.UNOBSERVABLE
-        assert "the rotation about z cannot be determined" in result.reasons[0].sentence
+        assert (
+            "the rotation about z cannot be determined"
+            in result.reasons[0].sentence
+        )
 
     def test_a_sensor_that_stands_still_is_not_to_be_used(self, streams):
         parent, _ = streams
         _, stamps_ns, rates = smooth_streams()
-        result = hec.calibrate(parent, Trajectory.from_rates(stamps_ns, 0.0 * rates))
+        result = hec.calibrate(
+            parent, Trajectory.from_rates(stamps_ns, 0.0 * rates)
+        )
         assert result.verdict is hec.Verdict.DO_NOT_USE
 
     @pytest.mark.parametrize(
@@ -162,7 +169,9 @@ class TestRates:
         parent, child = streams
         with pytest.raises(ConfigError, match="beside poses"):
             hec.calibrate(
-                Trajectory.from_positions(parent.stamps_ns, parent.poses[:, :3, 3]),
+                Trajectory.from_positions(
+                    parent.stamps_ns, parent.poses[:, :3, 3]
+                ),
                 child,
             )
 
@@ -205,13 +214,17 @@ class TestFiles:
         ]
         path = tmp_path / "imu.csv"
         path.write_text("\n".join([text, *rows]))
-        trajectory = read_trajectory_file(path, "auto", stamp_unit="s").trajectory
+        trajectory = read_trajectory_file(
+            path, "auto", stamp_unit="s"
+        ).trajectory
         assert trajectory.measures == "rates"
         assert np.abs(
             se3.rotation_log(trajectory.poses[1, :3, :3])
         ).max() == pytest.approx(largest)
 
-    def test_large_rates_without_a_unit_are_degrees_and_that_is_said(self, tmp_path):
+    def test_large_rates_without_a_unit_are_degrees_and_that_is_said(
+        self, tmp_path
+    ):
         path = tmp_path / "imu.csv"
         path.write_text("t,wx,wy,wz\n1,90,0,0\n2,90,0,0\n")
         reading = read_trajectory_file(path, "auto")
@@ -225,8 +238,13 @@ class TestFiles:
         path.write_text("1 0 0 1\n2 0 0 1\n")
         with pytest.raises(InputError, match="name the 4 with `columns`"):
             read_trajectory_file(path, "auto")
-        for columns, measures in (("t,wx,wy,wz", "rates"), ("t,x,y,z", "positions")):
-            trajectory = read_trajectory_file(path, "auto", columns=columns).trajectory
+        for columns, measures in (
+            ("t,wx,wy,wz", "rates"),
+            ("t,x,y,z", "positions"),
+        ):
+            trajectory = read_trajectory_file(
+                path, "auto", columns=columns
+            ).trajectory
             assert trajectory.measures == measures
 
     def test_the_command(self, streams, tmp_path, capsys):
@@ -264,12 +282,16 @@ class TestCheck:
         assert self.codes(parent, child) == []
         (finding,) = self.codes(parent, child.shifted(-7.0))
         assert (finding[0], finding[1]) == ("time_offset", "error")
-        assert finding[2]["time_offset"] == pytest.approx(7.0 + OFFSET_S, abs=1e-3)
+        assert finding[2]["time_offset"] == pytest.approx(
+            7.0 + OFFSET_S, abs=1e-3
+        )
 
     def test_rates_of_another_body_or_in_another_unit_are_unrelated(self):
         parent, stamps_ns, rates = smooth_streams(n_poses=100, seed=7)
         other = Trajectory(parent.stamps_ns, wandering_poses(100, seed=1))
-        assert self.codes(other, Trajectory.from_rates(stamps_ns, rates))[0][:2] == (
+        assert self.codes(other, Trajectory.from_rates(stamps_ns, rates))[0][
+            :2
+        ] == (
             "unrelated",
             "error",
         )
@@ -283,7 +305,9 @@ class TestCheck:
         still_ns = 75 * STEP_NS
         rest = np.arange(START_NS - still_ns, START_NS, STEP_NS)
         random = np.random.default_rng(0)
-        at_rest = parent.poses[0] @ se3.exp(1e-4 * random.normal(size=(len(rest), 6)))
+        at_rest = parent.poses[0] @ se3.exp(
+            1e-4 * random.normal(size=(len(rest), 6))
+        )
         poses = np.concatenate([at_rest, parent.poses])
         fine_ns = np.arange(stamps_ns[0] - still_ns, stamps_ns[0], STEP_NS // 5)
         quiet = BIAS + 2e-4 * random.normal(size=(len(fine_ns), 3))
@@ -299,17 +323,24 @@ class TestCheck:
 
     def test_one_axis_is_a_note_and_no_rotation_an_error(self):
         stamps_ns = START_NS + STEP_NS * np.arange(600)
-        turns = np.c_[np.zeros((600, 5)), np.cumsum(np.sin(np.arange(600) / 9.0)) / 20]
+        turns = np.c_[
+            np.zeros((600, 5)), np.cumsum(np.sin(np.arange(600) / 9.0)) / 20
+        ]
         noise = 1e-4 * np.random.default_rng(1).normal(size=(2, 600, 6))
         parent, child = (
-            Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(errors)) for errors in noise
+            Trajectory(stamps_ns, se3.exp(turns) @ se3.exp(errors))
+            for errors in noise
         )
         child = dataclasses.replace(child, measures="rotations")
         assert self.codes(parent, child) == [
             ("one_axis", "note", {"prior.yaw": "VALUE+/-SIGMA"})
         ]
-        still, also = (Trajectory(stamps_ns, se3.exp(errors)) for errors in noise)
-        (finding,) = self.codes(still, dataclasses.replace(also, measures="rotations"))
+        still, also = (
+            Trajectory(stamps_ns, se3.exp(errors)) for errors in noise
+        )
+        (finding,) = self.codes(
+            still, dataclasses.replace(also, measures="rotations")
+        )
         assert finding[:2] == ("unrelated", "error")
 
     def test_a_frozen_gyroscope_is_named(self):
@@ -328,18 +359,25 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
             writer.add_connection(topic, "sensor_msgs/msg/Imu", typestore=JAZZY)
             for topic in ("/imu", "/imu_again")
         ]
-        for stamp_ns, rate in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
+        for stamp_ns, rate in zip(
+            stamps_ns.tolist(), rates.tolist(), strict=True
+        ):
             for connection in connections:
                 writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
     parts = [str(tmp_path / name) for name in ("bag", "imu")]
     topics = ["--parent-topic", "/odom", "--child-topic", "/imu"]
     assert main(["replay", *parts, *topics, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert (document["measured"], document["child_frame"]) == ("rotations", "imu_link")
+    assert (document["measured"], document["child_frame"]) == (
+        "rotations",
+        "imu_link",
+    )
     assert document["rate_bias"]["rad_per_s"] == pytest.approx(BIAS, abs=3e-3)
     assert document["observability"][0]["sigma"] is None
     assert document["inputs"]["options"]["child_measures"] == "rates"
-    assert main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
+    assert (
+        main(["replay", *parts, *topics, "--child-measures", "positions"]) == 2
+    )
     assert "/imu has messages of type" in capsys.readouterr().err
     with_itself = [
         "--parent-topic",
@@ -351,7 +389,9 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
     ]
     assert main(["check", parts[1], *with_itself, "--json"]) == 1
     document = json.loads(capsys.readouterr().out)
-    assert [finding["code"] for finding in document["findings"]] == ["same_frame"]
+    assert [finding["code"] for finding in document["findings"]] == [
+        "same_frame"
+    ]
     assert document["streams"]["child"]["path_m"] is None
     gyroscope = hec.read_trajectory(parts[1], topic="/imu")
     assert (gyroscope.measures, len(gyroscope)) == ("rates", len(stamps_ns))
@@ -359,13 +399,17 @@ def test_a_bag_with_an_imu(tmp_path, capsys):
 
 class TestMessages:
     def test_values_that_a_message_says_it_does_not_have_are_not_numbers(self):
-        of_imu = unpack_poses([imu((0.1, 0.2, 0.3))], "sensor_msgs/msg/Imu", False)
+        of_imu = unpack_poses(
+            [imu((0.1, 0.2, 0.3))], "sensor_msgs/msg/Imu", False
+        )
         assert (of_imu.stamps_ns[0], of_imu.world_frames[0]) == (
             12_000_000_005,
             "imu_link",
         )
         assert of_imu.poses.tolist() == [[0.1, 0.2, 0.3, 0.0, 0.0, 0.6, 0.8]]
-        without = unpack_poses([imu((0, 0, 0), -1.0)], "sensor_msgs/msg/Imu", False)
+        without = unpack_poses(
+            [imu((0, 0, 0), -1.0)], "sensor_msgs/msg/Imu", False
+        )
         assert np.isnan(without.poses[0, :3]).all()
         fixes = unpack_poses(
             [fix(2), fix(-1)], "sensor_msgs/msg/NavSatFix", False
@@ -376,14 +420,20 @@ class TestMessages:
         reader = MessageReader("sensor_msgs/msg/NavSatFix", "positions")
         messages = [fix(0), fix(-1), fix(2, latitude=60.001)]
         columns, is_usable = reader.columns(messages, is_ros1=False)
-        assert (reader.n_left_out, is_usable.tolist()) == (1, [True, False, True])
+        assert (reader.n_left_out, is_usable.tolist()) == (
+            1,
+            [True, False, True],
+        )
         assert np.isnan(columns.poses[1]).all()
         assert columns.poses[0, :3] == pytest.approx([0, 0, 0])
         assert columns.poses[2, 1] == pytest.approx(111.4, abs=0.3)
         assert columns.sensor_frames[0] == "imu_link"
 
     def test_a_place_that_is_not_on_earth_is_refused_and_named(self):
-        far = ({"longitude": 1e300}, r"latitude [\d.]+ and longitude 1e\+300.*swapped")
+        far = (
+            {"longitude": 1e300},
+            r"latitude [\d.]+ and longitude 1e\+300.*swapped",
+        )
         for place, message in (
             ({"latitude": 139.7}, "latitude 139.7 and longitude 25.*swapped"),
             far,

@@ -48,9 +48,14 @@ def test_extrinsics_and_closure(rig, calibrated):
     assert calibrated.sensors == ("lidar", "front", "rear")
     assert calibrated.verdict is not hec.Verdict.DO_NOT_USE
     for sensor, calibration in enumerate(calibrated.calibrations, start=1):
-        error = se3.log(se3.inverse(rig.Xs[sensor]) @ calibration.T_parent_child)
+        error = se3.log(
+            se3.inverse(rig.Xs[sensor]) @ calibration.T_parent_child
+        )
         # One of 200 chi-squares with six degrees of freedom is larger.
-        assert error @ np.linalg.solve(calibration.covariance_measured, error) < 18.5
+        assert (
+            error @ np.linalg.solve(calibration.covariance_measured, error)
+            < 18.5
+        )
         assert (calibration.parent_frame, calibration.n_poses) == ("lidar", 500)
     chain = (
         calibrated.T("lidar", "front")
@@ -62,7 +67,9 @@ def test_extrinsics_and_closure(rig, calibrated):
     assert closure.closes
     assert 0.0 < closure.chi2 < 16.8
     assert closure.dof == 6
-    error = se3.log(se3.inverse(rig.Xs[1]) @ rig.Xs[2] @ calibrated.T("rear", "front"))
+    error = se3.log(
+        se3.inverse(rig.Xs[1]) @ rig.Xs[2] @ calibrated.T("rear", "front")
+    )
     between = se3.adjoint(calibrated.T("front", "rear")) @ np.linalg.cholesky(
         calibrated.covariance_measured("front", "rear")
     )
@@ -75,9 +82,13 @@ def test_a_sensor_of_inverse_poses_is_named_and_closes(rig):
     observed = hec.Trajectory(
         front.stamps_ns, se3.inverse(front.poses), "tag", "front_camera"
     )
-    calibrated = hec.calibrate_rig({"/lidar": lidar, "tag": observed, "rear": rear})
+    calibrated = hec.calibrate_rig(
+        {"/lidar": lidar, "tag": observed, "rear": rear}
+    )
     assert calibrated.sensors == ("lidar", "front_camera", "rear")
-    assert [calibration.child_frame for calibration in calibrated.calibrations] == [
+    assert [
+        calibration.child_frame for calibration in calibrated.calibrations
+    ] == [
         "front_camera",
         "rear",
     ]
@@ -95,7 +106,8 @@ def test_two_good_sensors_do_not_suffer_from_a_bad_first_one():
     sigmas = np.sqrt(np.diag(calibrated.neighbours[0].covariance_measured))
     assert (np.abs(apart) < 0.5 * sigmas).all()
     own, with_first = (
-        calibrated.covariance_measured(name, "rear") for name in ("front", "lidar")
+        calibrated.covariance_measured(name, "rear")
+        for name in ("front", "lidar")
     )
     assert np.trace(own) < 0.5 * np.trace(with_first)
 
@@ -122,12 +134,16 @@ def test_both_results_of_a_loop_that_does_not_close_are_used_with_care(
     assert opened.verdict is hec.Verdict.USE_WITH_CARE
     for result in opened.calibrations:
         warnings = [
-            found for found in result.findings if found.severity is not Severity.NOTE
+            found
+            for found in result.findings
+            if found.severity is not Severity.NOTE
         ]
         assert [found.code for found in warnings] == ["not_closed"]
         assert result.verdict is hec.Verdict.USE_WITH_CARE
     text = "\n".join(as_lines(opened))
-    sentence = "the three pairwise results of lidar, front and rear do not close"
+    sentence = (
+        "the three pairwise results of lidar, front and rear do not close"
+    )
     assert text.count(sentence) == 2
 
 
@@ -136,33 +152,49 @@ def test_a_bad_result_of_a_loop_does_not_lower_the_verdict_of_the_other(
 ):
     good, other = calibrated.calibrations
     bad = dataclasses.replace(other, findings=(JUMPS,))
-    opened = RigCalibration.of(calibrated.sensors, [good, bad], [turned_neighbour])
+    opened = RigCalibration.of(
+        calibrated.sensors, [good, bad], [turned_neighbour]
+    )
     assert not opened.closures[0].closes
     verdicts = [result.verdict for result in opened.calibrations]
     assert verdicts == [hec.Verdict.USE, hec.Verdict.DO_NOT_USE]
 
 
-@pytest.mark.parametrize("mounted", [False, True], ids=["same frame", "other frame"])
+@pytest.mark.parametrize(
+    "mounted", [False, True], ids=["same frame", "other frame"]
+)
 def test_copies_of_a_sensor_other_than_the_first_are_not_used(rig, mounted):
     lidar, front, rear = trajectories_of(rig).values()
-    X = se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.7])) if mounted else np.eye(4)
+    X = (
+        se3.exp(np.array([0.3, -0.2, 0.1, 0.5, 0.4, -0.7]))
+        if mounted
+        else np.eye(4)
+    )
     copy = hec.Trajectory(front.stamps_ns, front.poses @ X)
     calibrated = hec.calibrate_rig(
         {"lidar": lidar, "front": front, "rear": rear, "copy": copy}
     )
     assert calibrated.verdict is hec.Verdict.DO_NOT_USE
-    verdicts = [result.verdict is hec.Verdict.USE for result in calibrated.calibrations]
+    verdicts = [
+        result.verdict is hec.Verdict.USE for result in calibrated.calibrations
+    ]
     assert verdicts == [False, True, False]
     for result in (calibrated.calibrations[0], calibrated.calibrations[2]):
         assert result.findings[0].code == "not_independent"
-        assert result.findings[0].what.startswith("front and copy: both streams agree")
-    assert calibrated.headline == ("DO NOT USE: front and copy of 4 sensors; USE: rear")
+        assert result.findings[0].what.startswith(
+            "front and copy: both streams agree"
+        )
+    assert calibrated.headline == (
+        "DO NOT USE: front and copy of 4 sensors; USE: rear"
+    )
 
 
 def test_what_is_of_two_sensors_is_refused(rig):
     trajectories = trajectories_of(rig)
     with pytest.raises(InputError, match="at least three"):
-        hec.calibrate_rig({name: trajectories[name] for name in ("lidar", "front")})
+        hec.calibrate_rig(
+            {name: trajectories[name] for name in ("lidar", "front")}
+        )
     for options in (
         {"prior.z": "1.0 +/- 0.1"},
         {"time_offset": 0.1},
@@ -193,10 +225,14 @@ def test_the_command_prints_and_saves_all_sensors(files, capsys, tmp_path):
     page = (tmp_path / "rig/report.html").read_text(encoding="utf-8")
     assert "3 sensors in <code>lidar</code>" in page
     assert "lidar - front - rear closes: off by" in page
-    launch = (tmp_path / "rig/static_transform.launch.py").read_text(encoding="utf-8")
+    launch = (tmp_path / "rig/static_transform.launch.py").read_text(
+        encoding="utf-8"
+    )
     compile(launch, "launch", "exec")
     assert launch.count("'--frame-id', 'lidar'") == 2
-    translation = document["calibrations"]["rear"]["T_parent_child"]["translation"]
+    translation = document["calibrations"]["rear"]["T_parent_child"][
+        "translation"
+    ]
     assert_allclose(hec.load("rig/rear").T_parent_child[:3, 3], translation)
 
 
@@ -218,7 +254,8 @@ def test_a_person_sees_all_sensors_and_whether_pairs_close(calibrated):
         "rear in lidar",
     ]
     assert any(
-        line.startswith("  lidar - front - rear closes: off by") for line in lines
+        line.startswith("  lidar - front - rear closes: off by")
+        for line in lines
     )
 
 
@@ -229,11 +266,15 @@ def test_a_sensor_of_any_name_stays_below_the_directory(calibrated, tmp_path):
         dataclasses.replace(second, child_frame=".._$x$_a"),
     ]
     odd = dataclasses.replace(
-        calibrated, sensors=("$", "../$x$/a", ".._$x$_a"), calibrations=tuple(named)
+        calibrated,
+        sensors=("$", "../$x$/a", ".._$x$_a"),
+        calibrations=tuple(named),
     )
     save_rig(odd.to_dict(), named, tmp_path / "rig")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig"]
-    saved = sorted(path.name for path in (tmp_path / "rig").iterdir() if path.is_dir())
+    saved = sorted(
+        path.name for path in (tmp_path / "rig").iterdir() if path.is_dir()
+    )
     assert saved == ["__x__a", "__x__a_2"]
     assert "../$x$/a" in render_rig(odd, ["a.txt"])
     with pytest.raises(
@@ -257,14 +298,20 @@ def test_topics_of_a_bag(rig, tmp_path, capsys):
     assert document["inputs"]["topics"] == list(streams)
     assert main(["replay", bag, "--list", "--topics", *streams]) == 2
     assert "--topics cannot be combined with --list" in capsys.readouterr().err
-    assert main(["replay", bag, "--topics", "/lidar/odometry", "/lidar/odometry"]) == 2
+    assert (
+        main(["replay", bag, "--topics", "/lidar/odometry", "/lidar/odometry"])
+        == 2
+    )
     assert "have the sensor name 'lidar_link'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["rear.txt", "--parent-format", "tum"], "--parent-format is for two files"),
+        (
+            ["rear.txt", "--parent-format", "tum"],
+            "--parent-format is for two files",
+        ),
         (["front.txt"], "front.txt appears twice"),
         (
             ["rear.txt", "--installed", "0 0 0 0 0 0"],
@@ -297,7 +344,9 @@ def test_the_exit_code_is_that_of_two_sensors(
     monkeypatch.setattr(of_rig, "calibrated", lambda *_: failed)
     exit_code, _, err = run("calibrate", *files)
     assert (
-        exit_code == code == gravest_code(map(present.exit_code, failed.calibrations))
+        exit_code
+        == code
+        == gravest_code(map(present.exit_code, failed.calibrations))
     )
     advice = "front: the solver did not converge; do not use this result, record more varied motion"
     assert (advice in err) == (code == 1)
@@ -309,7 +358,9 @@ def test_labels_details_and_warnings_of_files_are_obeyed_as_with_two_sensors(
     trajectories = [*trajectories_of(rig).values()]
     monkeypatch.setattr(of_rig, "calibrate_rig", lambda *_: calibrated)
     monkeypatch.setattr(
-        command, "read_files", lambda *_: FilesRead(trajectories, [], ["look here"])
+        command,
+        "read_files",
+        lambda *_: FilesRead(trajectories, [], ["look here"]),
     )
     _, out, _ = run("calibrate", *files, "--json", "--label", "vehicle=7")
     document = json.loads(out)

@@ -38,9 +38,9 @@ def ranges(origins, directions):
     """Of rays (N, 3) that begin in the room."""
     with np.errstate(divide="ignore"):
         inverse = 1.0 / directions
-    distances = np.maximum(*((corner - origins) * inverse for corner in ROOM)).min(
-        axis=1
-    )
+    distances = np.maximum(
+        *((corner - origins) * inverse for corner in ROOM)
+    ).min(axis=1)
     for lower, upper in BOXES:
         first = (lower - origins) * inverse
         second = (upper - origins) * inverse
@@ -80,7 +80,9 @@ def scans(body, T_body_lidar, too_far, count, rng):
     since = np.arange(COLUMNS) / COLUMNS / RATE
     for number in range(count):
         Ts = body.poses(number / RATE + since) @ T_body_lidar
-        directions = np.einsum("cij,crj->cri", Ts[:, :3, :3], rays).reshape(-1, 3)
+        directions = np.einsum("cij,crj->cri", Ts[:, :3, :3], rays).reshape(
+            -1, 3
+        )
         distances = ranges(np.repeat(Ts[:, :3, 3], 16, axis=0), directions)
         distances += 0.01 * rng.standard_normal(len(distances)) + np.tile(
             too_far, COLUMNS
@@ -93,7 +95,11 @@ def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
     kind = {"time": (7, "<f4", 1.0), "t": (6, "<u4", 1e9)}[of_time]
     formats = ["<f4", "<f4", "<f4", kind[1]]
     offsets = [0, 4, 8, 18]
-    named = {"names": ["x", "y", "z", of_time], "formats": formats, "offsets": offsets}
+    named = {
+        "names": ["x", "y", "z", of_time],
+        "formats": formats,
+        "offsets": offsets,
+    }
     layout = np.dtype({**named, "itemsize": 24})
     rows = np.zeros(len(points), layout)
     for axis, values in zip("xyz", points.T, strict=True):
@@ -101,7 +107,12 @@ def cloud(typestore, stamp_ns, points, times, frame, of_time="time"):
     rows[of_time] = times * kind[2]
     field = typestore.types["sensor_msgs/msg/PointField"]
     fields = [
-        field(name=name, offset=int(layout.fields[name][1]), datatype=code, count=1)
+        field(
+            name=name,
+            offset=int(layout.fields[name][1]),
+            datatype=code,
+            count=1,
+        )
         for name, code in zip(layout.names, (7, 7, 7, kind[0]), strict=True)
     ]
     return cloud_of_rows(typestore, stamp_ns, rows, fields, frame)
@@ -119,7 +130,9 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     ):
         for number, scan in enumerate(scans(body, T, too_far[k], count, rng)):
             stamp_ns = START_NS + round(number / RATE * 1e9)
-            make = partial(cloud, stamp_ns=stamp_ns, frame=topic[1:], of_time=of_time)
+            make = partial(
+                cloud, stamp_ns=stamp_ns, frame=topic[1:], of_time=of_time
+            )
             make = partial(make, points=scan[0], times=scan[1])
             messages.append((stamp_ns, topic, POINTS, make))
     bag = write_messages(tmp_path / "drive", messages)
@@ -135,7 +148,9 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
     assert "odometry from 70 scans" in capsys.readouterr().err
     result = hec.load(tmp_path / "out")
     off = se3.log(se3.inverse(X) @ result.T_parent_child)
-    assert (np.linalg.norm(off.reshape(2, 3), axis=1) < [0.01, np.radians(0.1)]).all()
+    assert (
+        np.linalg.norm(off.reshape(2, 3), axis=1) < [0.01, np.radians(0.1)]
+    ).all()
     assert (result.parent_frame, result.child_frame) == ("front", "rear")
     # A pose is that of the middle of its scan. With a constant motion in each, 0.016 deg.
     middle_s = (np.arange(count) + 0.5 - 0.5 / COLUMNS) / RATE
@@ -144,9 +159,15 @@ def test_two_lidars_from_their_points(tmp_path, capsys, no_figures):
         kept = tmp_path / f"drive.{name}.odometry.npz"
         stored = np.load(kept)
         truth = body.poses(middle_s) @ T_body_lidar
-        assert_allclose(stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3)
-        poses = se3.from_quat_xyzw(stored["poses"][:, :3], stored["poses"][:, 3:])
-        turns = [se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)]
+        assert_allclose(
+            stored["stamps_ns"], START_NS + middle_s * 1e9, atol=1e3
+        )
+        poses = se3.from_quat_xyzw(
+            stored["poses"][:, :3], stored["poses"][:, 3:]
+        )
+        turns = [
+            se3.log(se3.inverse(T[:-1]) @ T[1:])[:, 3:] for T in (poses, truth)
+        ]
         assert np.degrees(np.sqrt(np.mean((turns[0] - turns[1]) ** 2))) < 0.0135
         # Without the correction, the ratio is 1.
         assert np.std(stored["too_far_m"][rings] - too_far[k]) < 0.6 * np.std(

@@ -31,7 +31,9 @@ def test_noise_free_sensors_move_as_one_body():
         atol=1e-12,
     )
     assert_allclose(
-        drive.parent.poses @ drive.T_parent_child @ se3.inverse(drive.child.poses),
+        drive.parent.poses
+        @ drive.T_parent_child
+        @ se3.inverse(drive.child.poses),
         np.tile(drive.T_pw_cw, (100, 1, 1)),
         atol=1e-12,
     )
@@ -48,10 +50,14 @@ def test_sensors_at_different_rates_are_on_one_body():
     drive = simulate_drive(1, config)
     inside = drive.child.stamps_ns <= drive.parent.stamps_ns[-1]
     Ts_pw_p = drive.parent.at(drive.child.stamps_ns[inside])
-    world = Ts_pw_p @ drive.T_parent_child @ se3.inverse(drive.child.poses[inside])
+    world = (
+        Ts_pw_p @ drive.T_parent_child @ se3.inverse(drive.child.poses[inside])
+    )
     assert inside.sum() > 50
     # All that is left is what interpolation over 5 ms leaves.
-    assert_allclose(world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3)
+    assert_allclose(
+        world, np.tile(drive.T_pw_cw, (len(world), 1, 1)), atol=2e-3
+    )
     assert not set(drive.child.stamps_ns[:20]) & set(drive.parent.stamps_ns)
 
 
@@ -91,12 +97,17 @@ def published_folder():
 @functools.cache
 def published_runs(folder, level):
     return [
-        [read_trajectory(run / f"{name}.txt").poses for name in ("T_S1_W1", "T_S2_W2")]
+        [
+            read_trajectory(run / f"{name}.txt").poses
+            for name in ("T_S1_W1", "T_S2_W2")
+        ]
         for run in sorted((folder / level).iterdir())
     ]
 
 
-def test_published_drives_lie_on_our_terrain_with_our_attitude(published_folder):
+def test_published_drives_lie_on_our_terrain_with_our_attitude(
+    published_folder,
+):
     for parent, _ in published_runs(published_folder, "noise/noise_0.000000"):
         x, y, height = parent[:, :3, 3].T
         to_body = np.swapaxes(parent[:, :3, :3], 1, 2)
@@ -138,7 +149,9 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
         squared_distances = np.square(errors).sum(axis=1)
         return np.sqrt(squared_distances.mean())
 
-    theirs = [list(map(rms, *sensors)) for sensors in zip(noisy, clean, strict=True)]
+    theirs = [
+        list(map(rms, *sensors)) for sensors in zip(noisy, clean, strict=True)
+    ]
     ours = [
         [
             rms(noisy_drive.parent.poses, two.parent.poses),
@@ -157,8 +170,13 @@ def test_noise_is_as_strong_as_published(published_folder, level, config):
 
 def test_command_writes_the_published_layout(tmp_path, run):
     options_given = ["--runs", "3", "--seed", "4", "--poses", "20", "--mixture"]
-    code, output, _ = run("simulate", "--out", tmp_path / "sims", *options_given)
-    assert (code, output) == (0, f"3 recordings written to {tmp_path / 'sims'}\n")
+    code, output, _ = run(
+        "simulate", "--out", tmp_path / "sims", *options_given
+    )
+    assert (code, output) == (
+        0,
+        f"3 recordings written to {tmp_path / 'sims'}\n",
+    )
     folders = sorted((tmp_path / "sims").iterdir())
     assert [path.name for path in folders] == ["run_01", "run_02", "run_03"]
     for number, folder in enumerate(folders):
@@ -179,7 +197,8 @@ def test_command_writes_the_published_layout(tmp_path, run):
 
 
 @pytest.mark.parametrize(
-    ("storage", "name"), [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")]
+    ("storage", "name"),
+    [("mcap", "bag"), ("sqlite3", "bag"), ("rosbag1", "bag.bag")],
 )
 def test_command_writes_bags(tmp_path, run, storage, name):
     from hand_eye_calib.formats.bags.reader import PoseBag
@@ -187,12 +206,17 @@ def test_command_writes_bags(tmp_path, run, storage, name):
     arguments = f"--drive hilly --poses 30 --bag {storage}".split()
     assert run("simulate", "--out", tmp_path / "sims", *arguments)[0] == 0
     drive = simulate_drive(
-        (0, 0), dataclasses.replace(options.HILLY_DRIVE, poses=30), options.REALISTIC
+        (0, 0),
+        dataclasses.replace(options.HILLY_DRIVE, poses=30),
+        options.REALISTIC,
     )
     with PoseBag(tmp_path / "sims" / "run_01" / name) as bag:
         topics = simulate_command.PARENT_TOPIC, simulate_command.CHILD_TOPIC
         poses = bag.poses(*topics)
-    for stream, trajectory in (("parent", drive.parent), ("child", drive.child)):
+    for stream, trajectory in (
+        ("parent", drive.parent),
+        ("child", drive.child),
+    ):
         ours = poses[poses.streams == stream]
         assert ours.stamps_ns.tolist() == trajectory.stamps_ns.tolist()
         assert ({*ours.sensor_frames}, {*ours.world_frames}) == (
@@ -215,7 +239,9 @@ def test_recordings_of_one_mount_have_the_extrinsic_of_the_first(run, tmp_path):
     for name, more in (("one", ["--same-mount"]), ("two", [])):
         run("simulate", "--out", tmp_path / name, "--runs", 2, *more)
         truths = [
-            read_trajectory(tmp_path / name / folder / "T_S2_S1.txt", "tum").poses
+            read_trajectory(
+                tmp_path / name / folder / "T_S2_S1.txt", "tum"
+            ).poses
             for folder in ("run_01", "run_02")
         ]
         assert np.array_equal(*truths) == bool(more)

@@ -62,7 +62,9 @@ class TestOptions:
             (same, lambda Ts: scaled(Ts, 2.0), {"scale": "estimate"}),
         ],
     )
-    def test_an_option_puts_right_what_it_says(self, of_robot, of_target, options):
+    def test_an_option_puts_right_what_it_says(
+        self, of_robot, of_target, options
+    ):
         robot, tracking, truth = arm(ON_HAND)
         config = CalibratorConfig(**options)
         result = calibrate_arm(of_robot(robot), of_target(tracking), config)
@@ -100,7 +102,8 @@ class TestInput:
         expected = calibrate_arm(robot, tracking).T_parent_child
         of_opencv = [(Ts[:, :3, :3], Ts[:, :3, 3:]) for Ts in (robot, tracking)]
         vectors = [
-            (se3.rotation_log(Ts[:, :3, :3]), Ts[:, :3, 3]) for Ts in (robot, tracking)
+            (se3.rotation_log(Ts[:, :3, :3]), Ts[:, :3, 3])
+            for Ts in (robot, tracking)
         ]
         rows = [se3.to_rows(Ts) for Ts in (robot, tracking)]
         lists = [[T.tolist() for T in Ts] for Ts in (robot, tracking)]
@@ -111,7 +114,9 @@ class TestInput:
 
     @pytest.mark.parametrize("shape", [(3,), (3, 1), (1, 3)])
     @pytest.mark.parametrize("are_vectors", [False, True])
-    def test_four_arrays_of_opencv_are_taken_in_its_order(self, are_vectors, shape):
+    def test_four_arrays_of_opencv_are_taken_in_its_order(
+        self, are_vectors, shape
+    ):
         robot, tracking, _ = arm(ON_HAND)
         expected = calibrate_arm(robot, tracking).T_parent_child
         arrays = []
@@ -127,7 +132,9 @@ class TestInput:
     def test_three_arrays_of_opencv_are_refused_with_the_right_order(self):
         robot, tracking, _ = arm(ON_HAND)
         with pytest.raises(InputError, match="R_gripper2base, t_gripper2base"):
-            calibrate_arm(robot[:, :3, :3], robot[:, :3, 3], tracking[:, :3, :3])
+            calibrate_arm(
+                robot[:, :3, :3], robot[:, :3, 3], tracking[:, :3, :3]
+            )
 
     @pytest.mark.parametrize("solve", [calibrate_arm, calibrate_stops])
     def test_what_is_no_pose_is_named_in_one_line(self, solve):
@@ -156,7 +163,9 @@ def test_stops_that_turn_about_two_axes_are_not_said_to_lack_them():
     config = CalibratorConfig(parent_scale=1.0, scale="none")
     result = calibrate_arm(scaled(robot, 1e3), tracking, config)
     assert result.verdict is hec.Verdict.DO_NOT_USE
-    assert "two axes" not in " ".join(reason.sentence for reason in result.reasons)
+    assert "two axes" not in " ".join(
+        reason.sentence for reason in result.reasons
+    )
 
 
 def test_two_files_need_no_stamps(tmp_path, capsys):
@@ -166,7 +175,11 @@ def test_two_files_need_no_stamps(tmp_path, capsys):
         vectors = np.c_[Ts[:, :3, 3], se3.rotation_log(Ts[:, :3, :3])]
         files.append(str(tmp_path / f"{name}.csv"))
         np.savetxt(
-            files[-1], vectors, delimiter=",", header="x,y,z,rx,ry,rz", comments=""
+            files[-1],
+            vectors,
+            delimiter=",",
+            header="x,y,z,rx,ry,rz",
+            comments="",
         )
     assert main(["calibrate", *files, "--order", "none", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
@@ -197,7 +210,9 @@ def test_degrees_under_names_of_rotation_vectors_are_refused(tmp_path, capsys):
         comments="",
     )
     stamps_ns = np.arange(len(tracking)) * 10**9
-    hec.write_trajectory(tmp_path / "camera.tum", hec.Trajectory(stamps_ns, tracking))
+    hec.write_trajectory(
+        tmp_path / "camera.tum", hec.Trajectory(stamps_ns, tracking)
+    )
     files = [str(tmp_path / name) for name in ("hand.csv", "camera.tum")]
     assert main(["calibrate", *files, "--order", "none"]) == 1
     assert "angles in degrees" in capsys.readouterr().err
@@ -210,7 +225,9 @@ def test_pairing_by_time_is_refused_for_stops(n_files, tmp_path, capsys):
     for name, Ts in (("hand", robot), ("camera", tracking)):
         np.save(tmp_path / f"{name}.npy", Ts)
     names = (
-        ["arm.npz"] if n_files == 1 else ["hand.npy", "camera.npy", "--order", "none"]
+        ["arm.npz"]
+        if n_files == 1
+        else ["hand.npy", "camera.npy", "--order", "none"]
     )
     words = [str(tmp_path / name) if "." in name else name for name in names]
     assert main(["calibrate", *words, "--pair-by", "time"]) == 2
@@ -220,7 +237,10 @@ def test_pairing_by_time_is_refused_for_stops(n_files, tmp_path, capsys):
 SIZED = {
     "metres": (same, same),
     "millimetres, target": (same, lambda Ts: scaled(Ts, 1e3)),
-    "millimetres, both": (lambda Ts: scaled(Ts, 1e3), lambda Ts: scaled(Ts, 1e3)),
+    "millimetres, both": (
+        lambda Ts: scaled(Ts, 1e3),
+        lambda Ts: scaled(Ts, 1e3),
+    ),
     "centimetres, target": (same, lambda Ts: scaled(Ts, 1e2)),
     "scalar first, both": (scalar_first, scalar_first),
 }
@@ -229,7 +249,9 @@ SIZED = {
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
 @pytest.mark.parametrize("size", [0.7, 1.2, 1.5])
 @pytest.mark.parametrize("name", SIZED)
-def test_the_options_that_a_finding_names_lead_to_the_right_answer(name, size, place):
+def test_the_options_that_a_finding_names_lead_to_the_right_answer(
+    name, size, place
+):
     of_robot, of_target = SIZED[name]
     robot, tracking, truth = arm(place, seed=5)
     sides = of_robot(robot), of_target(scaled(tracking, size))
@@ -259,7 +281,9 @@ def test_the_first_line_has_the_place_of_the_camera_but_no_setup_that_the_stops_
 
     assert result.headline.endswith(f"; camera {SETUPS[setup]}")
     assert result.setup == setup
-    assert hec.Calibration.from_dict(result.to_dict()).headline == result.headline
+    assert (
+        hec.Calibration.from_dict(result.to_dict()).headline == result.headline
+    )
     assert result.inverse().setup == setup
 
 
@@ -291,7 +315,9 @@ def test_a_setup_decides_where_the_stops_do_not():
 
 def test_an_unknown_setup_is_refused():
     robot, tracking, _ = arm(ON_HAND)
-    with pytest.raises(ConfigError, match="setup must be one of hand, beside; got"):
+    with pytest.raises(
+        ConfigError, match="setup must be one of hand, beside; got"
+    ):
         calibrate_arm(robot, tracking, setup="eye in hand")
 
 
@@ -303,13 +329,21 @@ def test_setup_is_an_option_of_arms_alone(tmp_path, capsys):
         files.append(str(tmp_path / f"{name}.npy"))
         np.save(files[-1], Ts)
 
-    assert main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "hand"]) == 0
-    assert main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "beside"]) == 3
+    assert (
+        main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "hand"]) == 0
+    )
+    assert (
+        main(["calibrate", str(tmp_path / "arm.npz"), "--setup", "beside"]) == 3
+    )
     capsys.readouterr()
     # Poses without an order are stops.
-    assert main(["calibrate", *files, "--order", "none", "--setup", "hand"]) == 0
+    assert (
+        main(["calibrate", *files, "--order", "none", "--setup", "hand"]) == 0
+    )
     capsys.readouterr()
-    assert main(["calibrate", *files, "--order", "time", "--setup", "hand"]) == 2
+    assert (
+        main(["calibrate", *files, "--order", "time", "--setup", "hand"]) == 2
+    )
     assert "the place of the camera of an arm" in capsys.readouterr().err
 
 
@@ -382,7 +416,9 @@ def test_targets_detected_mirrored_at_half_of_the_stops_are_left_out():
         ),
     ],
 )
-def test_the_place_in_the_file_is_held_against_inverse_poses(options, advice, capsys):
+def test_the_place_in_the_file_is_held_against_inverse_poses(
+    options, advice, capsys
+):
     """The sample file says eye_in_hand. The option that was given is not advised again."""
     command = ["arm", "sample:arm.yaml", "--parent-invert", "poses", *options]
     assert main(command) == 3

@@ -86,7 +86,9 @@ def test_errors_of_a_camera_are_weighted_by_their_source(random):
         rests = np.ones(len(stops))
         single.append(robot_world._likelier_fit(stops, rests))
         values.append(nees_of(solve(stops, stretch=1e-3), X, Z))
-    assert np.mean(errors_m(fits, truths)) < 0.8 * np.mean(errors_m(single, truths))
+    assert np.mean(errors_m(fits, truths)) < 0.8 * np.mean(
+        errors_m(single, truths)
+    )
     assert_nees(values, 8.0, 18.0)
 
 
@@ -101,7 +103,9 @@ def nees_of(fit, X, Z):
     ("outliers", "size", "n", "lowest_nees"),
     [(0, 1, 20, 8.0), (0.15, 1, 20, 8.0), (0, 0.98, 20, 4.0), (0, 1, 4, 4.0)],
 )
-def test_covariance_is_that_of_the_errors(random, outliers, size, n, lowest_nees):
+def test_covariance_is_that_of_the_errors(
+    random, outliers, size, n, lowest_nees
+):
     values = []
     for _ in range(40):
         X, Z, stops = recorded(random, n, outliers=outliers)
@@ -117,7 +121,9 @@ def test_covariance_is_that_of_errors_that_last(random):
         0.7 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     )
     for _ in range(30):
-        waves = np.sin(np.linspace(0.0, 6.0, n)[:, None] * random.uniform(0.5, 2.0, 6))
+        waves = np.sin(
+            np.linspace(0.0, 6.0, n)[:, None] * random.uniform(0.5, 2.0, 6)
+        )
         X, Z, stops = recorded(
             random, n, noise=0.0, Ts_world_parent=se3.exp(0.5 * waves)
         )

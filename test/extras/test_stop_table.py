@@ -36,7 +36,9 @@ def measured(robot, setup, random):
 
 @pytest.mark.parametrize("setup", SETUPS)
 @pytest.mark.parametrize("axis", ["x", "z"])
-def test_advice_for_turns_about_one_axis_is_to_turn_about_the_other_axes(setup, axis):
+def test_advice_for_turns_about_one_axis_is_to_turn_about_the_other_axes(
+    setup, axis
+):
     turns_rad = np.where(np.array([*"xyz"]) == axis, 0.3, 0.01)
     robot, tracking = arm(turns_rad, setup)
 
@@ -61,7 +63,9 @@ def test_advised_stops_reduce_sigma_more_than_other_stops(setup):
     start = robot[result.stops.start - 1]
     turns = []
     for stop in result.stops.next:
-        vector_rad = np.radians(stop.angle_deg) * np.eye(3)["xyz".index(stop.axis)]
+        vector_rad = (
+            np.radians(stop.angle_deg) * np.eye(3)["xyz".index(stop.axis)]
+        )
         turns.append(se3.exp(np.r_[0.0, 0.0, 0.0, vector_rad]))
     advised = start @ np.stack(turns)
     others, _ = arm((0.3, 0.01, 0.3), setup, n=3, seed=7)

@@ -45,7 +45,10 @@ def test_a_camera_in_the_hand_and_one_beside_the_robot_are_told_apart_and_kept(
     frames = ("hand", "base") if is_in_hand else ("base", "hand")
     assert (result.parent_frame, result.parent_world_frame) == frames
     assert (result.child_frame, result.child_world_frame) == ("eye", "target")
-    for estimate, truth in ((result.T_parent_child, X), (result.T_world_world, Z)):
+    for estimate, truth in (
+        (result.T_parent_child, X),
+        (result.T_world_world, Z),
+    ):
         assert np.abs(se3.log(se3.inverse(estimate) @ truth)).max() < 5e-3
     assert result.verdict is hec.Verdict.USE
     read = hec.Calibration.from_dict(result.to_dict())
@@ -85,7 +88,12 @@ def test_priors_on_wrong_axes_contradict(random):
 @pytest.mark.parametrize(
     ("file", "parent", "position", "within_m"),
     [
-        ("moveit_samples/pose_samples.json", "base", (0.659, -0.249, 0.830), 0.002),
+        (
+            "moveit_samples/pose_samples.json",
+            "base",
+            (0.659, -0.249, 0.830),
+            0.002,
+        ),
         ("camodocal_example/TransformPairsInput.yml", "base", None, 0.0),
     ],
 )
@@ -102,15 +110,25 @@ def test_samples_of_others(file, parent, position, within_m):
 
 
 class TestCommand:
-    def test_samples_are_the_only_path(self, random, tmp_path, capsys, no_figures):
+    def test_samples_are_the_only_path(
+        self, random, tmp_path, capsys, no_figures
+    ):
         robot, tracking, X, _ = arm(random)
-        pairs = [[a.tolist(), b.tolist()] for a, b in zip(robot, tracking, strict=True)]
+        pairs = [
+            [a.tolist(), b.tolist()]
+            for a, b in zip(robot, tracking, strict=True)
+        ]
         (tmp_path / "samples.json").write_text(json.dumps(pairs))
         out = tmp_path / "out"
         assert (
-            main(["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]) == 0
+            main(
+                ["calibrate", str(tmp_path / "samples.json"), "--out", str(out)]
+            )
+            == 0
         )
-        assert "camera in hand: maps coordinates" in (output := capsys.readouterr().out)
+        assert "camera in hand: maps coordinates" in (
+            output := capsys.readouterr().out
+        )
         assert "target in base" in output
         assert_allclose(hec.load(out).T_parent_child, X, atol=5e-3)
 
@@ -152,18 +170,25 @@ def test_a_target_with_the_poses_of_the_robot_is_a_copy(random, convert):
     assert result.findings[0].code == "same_frame"
 
 
-@pytest.mark.parametrize(("error_m", "codes"), [(0.003, []), (0.1, ["outliers"])])
+@pytest.mark.parametrize(
+    ("error_m", "codes"), [(0.003, []), (0.1, ["outliers"])]
+)
 def test_only_clear_outliers_are_reported(random, error_m, codes):
     robot, tracking, *_ = arm(random, n=40)
     tracking[[5, 20], :3, 3] += error_m
 
     result = calibrate_arm(robot, tracking)
 
-    assert [row.number for row in result.stops.rows if not row.is_used] == [6, 21]
+    assert [row.number for row in result.stops.rows if not row.is_used] == [
+        6,
+        21,
+    ]
     assert codes_of(result.findings) == codes
 
 
-@pytest.mark.parametrize(("tilt_deg", "codes"), [(2.0, []), (25.0, ["outliers"])])
+@pytest.mark.parametrize(
+    ("tilt_deg", "codes"), [(2.0, []), (25.0, ["outliers"])]
+)
 @pytest.mark.parametrize("setup", ["hand", "beside"])
 def test_a_tilt_of_a_target_seen_from_the_front_is_not_reported(
     random, setup, tilt_deg, codes

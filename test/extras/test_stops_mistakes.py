@@ -34,14 +34,26 @@ REPAIRED = {
     "scalar first, both": (scalar_first, scalar_first, "w x y z"),
     "scalar first, robot": (scalar_first, same, "w x y z"),
     "scalar first, target": (same, scalar_first, "w x y z"),
-    "rotations inverted, robot": (transposed_rotations, same, "seem to be inverted"),
-    "rotations inverted, target": (same, transposed_rotations, "seem to be inverted"),
+    "rotations inverted, robot": (
+        transposed_rotations,
+        same,
+        "seem to be inverted",
+    ),
+    "rotations inverted, target": (
+        same,
+        transposed_rotations,
+        "seem to be inverted",
+    ),
     "rotations inverted, both": (
         transposed_rotations,
         transposed_rotations,
         "seem to be inverted",
     ),
-    "millimetres, robot": (lambda Ts: scaled(Ts, 1e3), same, "lengths are millimetres"),
+    "millimetres, robot": (
+        lambda Ts: scaled(Ts, 1e3),
+        same,
+        "lengths are millimetres",
+    ),
     "millimetres, target": (
         same,
         lambda Ts: scaled(Ts, 1e3),
@@ -67,7 +79,9 @@ REFUSED = {
     "reversed": (same, lambda Ts: Ts[::-1], "rows"),
     "sorted by name": (
         same,
-        lambda Ts: Ts[np.argsort([str(row) for row in range(len(Ts))], kind="stable")],
+        lambda Ts: Ts[
+            np.argsort([str(row) for row in range(len(Ts))], kind="stable")
+        ],
         "rows",
     ),
     "angles as rotation vectors": (angles_as_vectors, same, "angles"),
@@ -80,7 +94,9 @@ REFUSED = {
 
 
 def words(result):
-    return " ".join([*(finding.what for finding in result.findings), *result.warnings])
+    return " ".join(
+        [*(finding.what for finding in result.findings), *result.warnings]
+    )
 
 
 @pytest.mark.parametrize("place", [ON_HAND, BESIDE])
@@ -217,7 +233,11 @@ def far_marker(seed):
     turns = pose((0.0, 0.0, 0.0), (3.0, 0.1, 0.2))[:3, :3] @ se3.rotation_exp(
         random.normal(size=(25, 3)) * 0.35
     )
-    positions = [0.0, 0.0, 1.5] + random.normal(size=(25, 3)) * [0.08, 0.06, 0.15]
+    positions = [0.0, 0.0, 1.5] + random.normal(size=(25, 3)) * [
+        0.08,
+        0.06,
+        0.15,
+    ]
     views = se3.from_rotation_translation(turns, positions)
     camera = pose((1.1, 0.2, 0.8), (-1.2, 1.4, -0.6))
     target = pose((0.02, 0.0, 0.1), (0.1, 0.2, 0.3))
@@ -235,7 +255,9 @@ def far_marker(seed):
 # Seeds whose rough fits gain less than the limit by other axes.
 @pytest.mark.parametrize("seed", [4, 6, 8])
 class TestFarMarkerWithStrongNoise:
-    def test_flipped_axes_are_refused_though_rough_fits_hardly_differ(self, seed):
+    def test_flipped_axes_are_refused_though_rough_fits_hardly_differ(
+        self, seed
+    ):
         robot, tracking = far_marker(seed)
         result = calibrate_arm(robot, flipped(tracking))
         assert codes_of(result.findings) == ["axes"]
@@ -289,7 +311,9 @@ def test_a_refused_arm_has_its_cause_alone_and_exit_code_3(
 def test_positions_do_not_overrule_rotations_on_which_way_round_it_is(seed):
     """Few stops with small rotations seem to fit the other way round, but for large errors."""
     robot, tracking, truth = arm(ON_HAND, seed=seed, n=12)
-    result = calibrate_arm(transposed_rotations(robot), transposed_rotations(tracking))
+    result = calibrate_arm(
+        transposed_rotations(robot), transposed_rotations(tracking)
+    )
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)
     assert np.linalg.norm(error[:3]) < 2.0 * WITHIN_M
     assert "read as a camera on the hand" in words(result)
@@ -318,7 +342,9 @@ def test_what_moved_is_refused_by_name_with_its_size(
     (movement,) = result.findings
     assert movement.code == "moved"
     assert f"the {part} moved by" in movement.what
-    assert movement.evidence["size_mm"] == pytest.approx(1e3 * shift_m, rel=0.25)
+    assert movement.evidence["size_mm"] == pytest.approx(
+        1e3 * shift_m, rel=0.25
+    )
     assert abs(movement.evidence["number"] - (row + 1)) <= 2
 
 

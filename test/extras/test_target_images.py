@@ -57,7 +57,9 @@ def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
     X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
     Z = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3])
     hand = Z @ se3.inverse(Ts_camera_target) @ se3.inverse(X)
-    write_trajectory(tmp_path / "hand.tum", Trajectory(10**9 * np.arange(1, 31), hand))
+    write_trajectory(
+        tmp_path / "hand.tum", Trajectory(10**9 * np.arange(1, 31), hand)
+    )
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     folder = tmp_path / "images"
     folder.mkdir()
@@ -70,7 +72,10 @@ def test_thirty_images_calibrate_a_hand(tmp_path, capsys, no_figures):
         str(tmp_path / "camera.yaml"),
     ]
     target = ["--target", "charuco:7x5:0.05:0.037:5X5_100"]
-    assert main(["calibrate", *paths, *target, "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["calibrate", *paths, *target, "--out", str(tmp_path / "out")])
+        == 0
+    )
     assert "visible in 30 of 30 images" in capsys.readouterr().err
     off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.linalg.norm(off[:3]) < 1e-3
@@ -96,9 +101,13 @@ def test_aprilgrid_has_the_frame_of_kalibr():
     Ts = views(3, [0.1, 0.07, 0.0], rng)
     target = Target.parse(f"aprilgrid:{columns}x{rows}:{size}:{gap}")
     images = [rendered(picture, T, rng) for T in Ts]
-    tracking = poses_of_target(images, target, Camera(MATRIX, np.zeros(5), False))
+    tracking = poses_of_target(
+        images, target, Camera(MATRIX, np.zeros(5), False)
+    )
     off = se3.log(
-        Ts[tracking.images] @ T_picture_target @ se3.inverse(tracking.Ts_camera_target)
+        Ts[tracking.images]
+        @ T_picture_target
+        @ se3.inverse(tracking.Ts_camera_target)
     )
     assert tracking.images == [0, 1, 2]
     assert np.abs(off[:, :3]).max() < 5e-3
@@ -117,9 +126,21 @@ def image_messages(stamp_ns, image):
     compressed = types["sensor_msgs/msg/CompressedImage"](head, "png", coded)
     region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     P = np.c_[MATRIX, np.zeros(3)].ravel()
-    lens = "plumb_bob", np.zeros(5), MATRIX.ravel(), np.eye(3).ravel(), P, 0, 0, region
+    lens = (
+        "plumb_bob",
+        np.zeros(5),
+        MATRIX.ravel(),
+        np.eye(3).ravel(),
+        P,
+        0,
+        0,
+        region,
+    )
     info = types["sensor_msgs/msg/CameraInfo"](head, height, width, *lens)
-    for topic, message in (("image_raw", raw), ("image_raw/compressed", compressed)):
+    for topic, message in (
+        ("image_raw", raw),
+        ("image_raw/compressed", compressed),
+    ):
         yield (
             stamp_ns,
             f"/eye/{topic}",
@@ -129,7 +150,9 @@ def image_messages(stamp_ns, image):
     yield stamp_ns, "/eye/camera_info", info.__msgtype__, lambda _: info
 
 
-def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figures):
+def test_the_images_of_a_bag_are_poses_of_the_camera(
+    tmp_path, capsys, no_figures
+):
     rng = np.random.default_rng(7)
     count = 16
     times = np.arange(count) / 6
@@ -141,7 +164,9 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     far = [0.0, 0.0, 0.62]
     Ts = se3.from_rotation_translation(Rs, far - Rs @ [0.175, 0.125, 0.0])
     X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
-    hand = Trajectory(stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base")
+    hand = Trajectory(
+        stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base"
+    )
     messages = [
         (
             stamp_ns,
@@ -159,17 +184,25 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
     bag = write_messages(tmp_path / "bag", messages)
     board = "charuco:7x5:0.05:0.037:5X5_100"
     with pytest.warns(
-        UserWarning, match="visible in 16 of 16 images, with corner residuals of 0[.]"
+        UserWarning,
+        match="visible in 16 of 16 images, with corner residuals of 0[.]",
     ):
         trajectory = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
     off = se3.log(Ts @ trajectory.poses)
     assert np.median(np.abs(off[:, :3])) < 1e-3
     assert np.degrees(np.median(np.abs(off[:, 3:]))) < 0.1
-    assert (trajectory.world_frame, trajectory.sensor_frame) == ("target", "eye")
+    assert (trajectory.world_frame, trajectory.sensor_frame) == (
+        "target",
+        "eye",
+    )
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     with PoseBag(bag) as opened:
-        of_file = f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
-        assert_array_equal(opened.trajectory(of_file)[0].poses, trajectory.poses)
+        of_file = (
+            f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
+        )
+        assert_array_equal(
+            opened.trajectory(of_file)[0].poses, trajectory.poses
+        )
         for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
             (f"/hand?{board}", "contains no images"),
@@ -184,7 +217,10 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, capsys, no_figure
         "--target",
         board,
     ]
-    assert main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")])
+        == 0
+    )
     error = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.abs(error[:3]).max() < 3e-3
     assert np.degrees(np.abs(error[3:]).max()) < 0.2
@@ -232,12 +268,16 @@ def test_intrinsics_of_visp(tmp_path):
             read_camera(path)
 
 
-def test_a_folder_with_images_and_a_file_for_each_pose(tmp_path, capsys, no_figures):
+def test_a_folder_with_images_and_a_file_for_each_pose(
+    tmp_path, capsys, no_figures
+):
     rng = np.random.default_rng(11)
     picture = charuco_picture()
     Ts_camera_target = views(10, [0.175, 0.125, 0.0], rng)
     X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
-    hand = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3]) @ se3.inverse(X @ Ts_camera_target)
+    hand = se3.exp([0.7, 0.2, 0.1, 2.0, 0.5, -0.3]) @ se3.inverse(
+        X @ Ts_camera_target
+    )
     hand = hand @ se3.exp(rng.normal(0.0, 1e-4, (10, 6)))
     folder = tmp_path / "stops"
     folder.mkdir()
@@ -245,7 +285,8 @@ def test_a_folder_with_images_and_a_file_for_each_pose(tmp_path, capsys, no_figu
         zip(Ts_camera_target, hand, strict=True), start=1
     ):
         cv2.imwrite(
-            str(folder / f"image-{number}.png"), rendered(picture, T_camera_target, rng)
+            str(folder / f"image-{number}.png"),
+            rendered(picture, T_camera_target, rng),
         )
         np.savetxt(folder / f"franka_pose_rPe_{number}.txt", T_base_hand)
     (folder / "camera.xml").write_text(VISP_CAMERA.replace("-0.1", "0"))
@@ -255,13 +296,23 @@ def test_a_folder_with_images_and_a_file_for_each_pose(tmp_path, capsys, no_figu
         "--out",
         str(tmp_path / "out"),
     ]
-    main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments])
+    main(
+        ["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments]
+    )
     assert "visible in 10 of 10 images" in capsys.readouterr().err
     off = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
     assert np.linalg.norm(off[:3]) < 2e-3
     (folder / "franka_pose_rPe_3.txt").unlink()
     assert (
-        main(["arm", str(folder), "--camera", str(folder / "camera.xml"), *arguments])
+        main(
+            [
+                "arm",
+                str(folder),
+                "--camera",
+                str(folder / "camera.xml"),
+                *arguments,
+            ]
+        )
         == 1
     )
     assert "9 poses and" in capsys.readouterr().err
@@ -308,7 +359,9 @@ def chessboard_picture(columns, rows, square):
 
 def marker_picture(name, number, size):
     """A marker with a white border of a quarter of its side."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
+    dictionary = cv2.aruco.getPredefinedDictionary(
+        getattr(cv2.aruco, f"DICT_{name}")
+    )
     side = round(size * PIXELS_PER_M)
     marker = cv2.aruco.generateImageMarker(dictionary, number, side)
     return np.pad(marker, side // 4, constant_values=255)
@@ -321,7 +374,10 @@ def old_charuco_picture(columns, rows, square, marker):
     if not hasattr(board, "setLegacyPattern"):
         pytest.skip("needs OpenCV 4.8 or newer")
     board.setLegacyPattern(True)
-    size = (round(columns * square * PIXELS_PER_M), round(rows * square * PIXELS_PER_M))
+    size = (
+        round(columns * square * PIXELS_PER_M),
+        round(rows * square * PIXELS_PER_M),
+    )
     return board.generateImage(size)
 
 
@@ -336,7 +392,9 @@ def rolled(Ts, angles):
 BOARDS = {
     "chessboard:7x4:0.03": partial(chessboard_picture, 7, 4, 0.03),
     "chessboard:4x7:0.03": partial(chessboard_picture, 4, 7, 0.03),
-    "charuco-old:5x6:0.04:0.03:5X5_100": partial(old_charuco_picture, 5, 6, 0.04, 0.03),
+    "charuco-old:5x6:0.04:0.03:5X5_100": partial(
+        old_charuco_picture, 5, 6, 0.04, 0.03
+    ),
 }
 MARKERS = {
     "marker:7:0.16:5X5_50": partial(marker_picture, "5X5_50", 7, 0.16),
@@ -373,11 +431,14 @@ def test_motions_of_other_targets(text):
 
 def test_only_the_marker_of_the_target_is_used():
     (T,) = views(1, [0.12, 0.12, 0.0], np.random.default_rng(9))
-    image = rendered(marker_picture("5X5_50", 7, 0.16), T, np.random.default_rng(10))
+    image = rendered(
+        marker_picture("5X5_50", 7, 0.16), T, np.random.default_rng(10)
+    )
     camera = Camera(MATRIX, np.zeros(5), is_fisheye=False)
     for number in (6, 8):
         with pytest.raises(
-            InputError, match=f"4 corners of the target marker {number} of 5X5_50"
+            InputError,
+            match=f"4 corners of the target marker {number} of 5X5_50",
         ):
             poses_of_target(
                 [image], Target.parse(f"marker:{number}:0.16:5X5_50"), camera
@@ -393,7 +454,9 @@ def test_a_chessboard_that_looks_the_same_after_half_a_turn_is_refused():
         Target.parse("chessboard:7x5:0.03")
 
 
-@pytest.mark.parametrize("text", ["marker:7:0.16:5X5_50", "chessboard:7x4:0.03"])
+@pytest.mark.parametrize(
+    "text", ["marker:7:0.16:5X5_50", "chessboard:7x4:0.03"]
+)
 def test_sigmas_are_as_large_as_the_errors(text, monkeypatch):
     """Corners with errors of 0.2 pixels. Only two of a marker's eight residuals are redundant."""
     rng = np.random.default_rng(61)

@@ -6,12 +6,21 @@ import re
 import browser
 import numpy as np
 import pytest
-from target_rendering import CAMERA_INFO, MATRIX, charuco_picture, rendered, views
+from target_rendering import (
+    CAMERA_INFO,
+    MATRIX,
+    charuco_picture,
+    rendered,
+    views,
+)
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.extras.sensors.corners import figures_of_corners, reprojections
+from hand_eye_calib.extras.sensors.corners import (
+    figures_of_corners,
+    reprojections,
+)
 from hand_eye_calib.extras.sensors.target_images import (
     TargetFinder,
 )
@@ -91,7 +100,9 @@ def test_the_worst_stop_is_drawn_first_and_named(arm_images, capsys):
     out = folder / "out"
     assert main(["arm", *paths, *options, "--out", str(out)]) == 0
     page = (out / "report.html").read_text()
-    (figure,) = re.findall(r'<figure[^>]*id="figure-corners".*?</figure>', page, re.S)
+    (figure,) = re.findall(
+        r'<figure[^>]*id="figure-corners".*?</figure>', page, re.S
+    )
     assert f"the worst, stop {WRONG + 1}," in figure
     assert "the fit leaves this stop out" in figure
     tiles = re.findall(r'<g transform="translate.*?</g>.*?</g>', figure, re.S)
@@ -100,29 +111,37 @@ def test_the_worst_stop_is_drawn_first_and_named(arm_images, capsys):
     far = []
     for tile in tiles:
         circles = np.array(
-            re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', tile), dtype=float
+            re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)"', tile),
+            dtype=float,
         )
         # A cross begins at its left end.
         left = re.findall(r"M([\d.-]+) ([\d.-]+)h12", tile)
         crosses = np.add(np.array(left, dtype=float), [6.0, 0.0])
         assert len(circles) == 24
-        distances = np.linalg.norm(circles[:, None] - crosses, axis=2).min(axis=1)
+        distances = np.linalg.norm(circles[:, None] - crosses, axis=2).min(
+            axis=1
+        )
         far.append(np.median(distances))
         (data,) = re.findall(r"base64,([^\"]+)", tile)
         part = cv2.imdecode(
-            np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_GRAYSCALE
+            np.frombuffer(base64.b64decode(data), np.uint8),
+            cv2.IMREAD_GRAYSCALE,
         )
         # A corner of a board is between dark and bright squares, at the place of its circle.
         (width,) = re.findall(r'<image width="([\d.]+)"', tile)
         for u, v in circles * part.shape[1] / float(width):
-            near = part[round(v) - 4 : round(v) + 5, round(u) - 4 : round(u) + 5]
+            near = part[
+                round(v) - 4 : round(v) + 5, round(u) - 4 : round(u) + 5
+            ]
             assert np.ptp(near.astype(int)) > 100
     assert far[0] > 6.0 > 3.0 > max(far[1:])
     assert sum(map(len, tiles)) < 400_000
     assert browser.printed_pages(out / "report.html", folder) == 2
 
 
-def test_poses_that_the_result_does_not_use_as_they_are_have_no_picture(arm_images):
+def test_poses_that_the_result_does_not_use_as_they_are_have_no_picture(
+    arm_images,
+):
     folder, images, Ts_camera_target = arm_images
     finder = TargetFinder.parse(TARGET, folder / "camera.yaml")
     for image in images:
@@ -132,5 +151,6 @@ def test_poses_that_the_result_does_not_use_as_they_are_have_no_picture(arm_imag
         robot_of(Ts_camera_target, "hand")[1:], found.Ts_camera_target[1:]
     )
     assert (
-        figures_of_corners(result, found, finder.camera, [], images.__getitem__) == []
+        figures_of_corners(result, found, finder.camera, [], images.__getitem__)
+        == []
     )

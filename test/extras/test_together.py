@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 import real_data
 from fleet_making import recordings_of
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose
 from result_making import SHIFTED_FROM as X
 from result_making import SIGMAS, shift, written_finding
@@ -43,7 +49,9 @@ def pair(seed, n_poses=150):
     poses = wandering_poses(n_poses, seed=seed)
     child = disturbed(child_of(poses), seed, 5e-4, 5e-4)
     return (
-        as_trajectory(disturbed(poses, 100 + seed, 5e-4, 5e-4), sensor_frame="lidar"),
+        as_trajectory(
+            disturbed(poses, 100 + seed, 5e-4, 5e-4), sensor_frame="lidar"
+        ),
         as_trajectory(child, sensor_frame="camera"),
     )
 
@@ -74,7 +82,9 @@ def test_an_axis_that_one_recording_hides_comes_from_another():
     flat = dataclasses.replace(flat, covariance_measured=hidden)
     joint = together(named(flat, flat, result()))
     assert joint.status is SolveStatus.OK
-    assert deviation(joint.T_parent_child, X) == pytest.approx(np.zeros(6), abs=1e-3)
+    assert deviation(joint.T_parent_child, X) == pytest.approx(
+        np.zeros(6), abs=1e-3
+    )
     assert joint.sigmas_measured[0] < joint.sigmas_measured[2] < 0.03
     both = together(named(flat, flat))
     assert both.unobservable() == ["z"]
@@ -122,7 +132,9 @@ def test_what_does_not_belong_is_named_and_left_out(
     )
     assert joint.together.kind == kind
     assert {
-        recording.name for recording in joint.together.recordings if recording.left_out
+        recording.name
+        for recording in joint.together.recordings
+        if recording.left_out
     } == left_out
     assert joint.verdict is verdict
     if kind in ("one off", "agree"):
@@ -137,7 +149,9 @@ def test_what_does_not_belong_is_named_and_left_out(
 def test_recordings_that_nobody_may_use_are_left_out():
     failed = result(status=SolveStatus.NOT_CONVERGED)
     joint = together(named(result(), failed))
-    assert [bool(recording.left_out) for recording in joint.together.recordings] == [
+    assert [
+        bool(recording.left_out) for recording in joint.together.recordings
+    ] == [
         False,
         True,
     ]
@@ -151,7 +165,9 @@ def test_recordings_that_nobody_may_use_are_left_out():
 
 def test_the_common_result_has_the_gravest_findings_and_all_warnings():
     small = written_finding("jumps", Severity.NOTE, "few jumps", stream="child")
-    large = written_finding("jumps", Severity.WARNING, "many jumps", stream="child")
+    large = written_finding(
+        "jumps", Severity.WARNING, "many jumps", stream="child"
+    )
     other = written_finding("jumps", Severity.NOTE, "a jump", stream="parent")
     first = dataclasses.replace(
         result(0), findings=(large, other), warnings=("m", "repaired")
@@ -173,7 +189,11 @@ def test_python_takes_pairs_of_trajectories():
         "tuesday",
     ]
     assert (joint.parent_frame, joint.child_frame) == ("lidar", "camera")
-    named = {"a": pairs[0], "b": pairs[1], "c": (pairs[0][0][:5], pairs[0][1][:5])}
+    named = {
+        "a": pairs[0],
+        "b": pairs[1],
+        "c": (pairs[0][0][:5], pairs[0][1][:5]),
+    }
     table = hec.calibrate_many(named, checks=False)
     assert table.error.isna().to_dict() == {"a": True, "b": True, "c": False}
     assert table.x_m["a"] == pytest.approx(T_PARENT_CHILD[0, 3], abs=3e-3)
@@ -200,8 +220,12 @@ def results_of(seed, count, unknown_z=False, apart=(), factor=1.0):
 @pytest.mark.parametrize("count", [2, 3, 8, 30])
 def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
     seeds = range(40 if count < 10 else 15)
-    agreements = [agreement_of(*results_of(seed, count, unknown_z)) for seed in seeds]
-    alarms = [agreement.kind for agreement in agreements if agreement.kind != "agree"]
+    agreements = [
+        agreement_of(*results_of(seed, count, unknown_z)) for seed in seeds
+    ]
+    alarms = [
+        agreement.kind for agreement in agreements if agreement.kind != "agree"
+    ]
     assert len(alarms) <= 4  # 0.8 expected, 5 or more once in 800
     p_value = np.mean([agreement.p_value for agreement in agreements])
     assert p_value > 0.35, (
@@ -217,7 +241,12 @@ def test_honest_results_agree_with_the_chance_that_is_stated(count, unknown_z):
 @pytest.mark.parametrize("unknown_z", [False, True])
 @pytest.mark.parametrize(
     ("apart", "kind"),
-    [([4], "one off"), ([0], "one off"), ([7], "one off"), ([5, 6, 7], "moved")],
+    [
+        ([4], "one off"),
+        ([0], "one off"),
+        ([7], "one off"),
+        ([5, 6, 7], "moved"),
+    ],
 )
 def test_which_one_is_off_and_since_when(apart, kind, unknown_z):
     for seed in range(10):
@@ -234,7 +263,9 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
         agreement_of(*results_of(seed, 12, factor=0.25)) for seed in range(20)
     ]
     excesses = [
-        agreement.excess for agreement in agreements if agreement.kind == "scatter"
+        agreement.excess
+        for agreement in agreements
+        if agreement.kind == "scatter"
     ]
     assert len(excesses) >= 19
     assert min(excesses) > 1.5
@@ -246,7 +277,11 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
 def test_a_single_result_and_one_that_knows_nothing():
     Ts, covariances = results_of(3, 2)
     agreement = agreement_of(Ts[:1], covariances[:1])
-    assert (agreement.kind, agreement.dof, agreement.p_value) == ("single", 0, 1.0)
+    assert (agreement.kind, agreement.dof, agreement.p_value) == (
+        "single",
+        0,
+        1.0,
+    )
     assert_allclose(agreement.T_parent_child, Ts[0])
     covariances[1] = np.diag([np.inf] * 6)
     agreement = agreement_of(Ts, covariances)
@@ -307,12 +342,14 @@ def test_chance_makes_a_change_less_than_once_in_a_hundred():
 def test_a_change_of_the_size_that_is_said_to_be_seen_is_seen(axis):
     seen = compare([result(), result()]).differences[0].axes[axis].visible
     differences = [
-        compare([result(seed=i), result(shift(axis, seen), seed=100 + i)]).differences[
-            0
-        ]
+        compare(
+            [result(seed=i), result(shift(axis, seen), seed=100 + i)]
+        ).differences[0]
         for i in range(20)
     ]
-    named = [difference.axes[axis].verdict == "moved" for difference in differences]
+    named = [
+        difference.axes[axis].verdict == "moved" for difference in differences
+    ]
     assert np.mean(named) >= 0.9  # sigmas are taken larger than stated
 
 
@@ -357,7 +394,10 @@ def test_a_mount_that_moved_by_3_cm_and_1_deg_is_found(sigma_z, axis):
     sigma_rad = np.radians(0.05)
     sigmas = np.array([0.002, 0.002, sigma_z, sigma_rad, sigma_rad, sigma_rad])
     floor_sigmas = np.repeat([0.005, np.radians(0.15)], 3)
-    options = {"sigmas": sigmas, "covariance_allowance": np.diag(floor_sigmas**2)}
+    options = {
+        "sigmas": sigmas,
+        "covariance_allowance": np.diag(floor_sigmas**2),
+    }
     moved = shift(AXES[axis], 0.03) + shift(rotation_axis, np.radians(1.0))
     drawing = Extrinsic(X, "drawing")
     for seed in range(5):
@@ -376,7 +416,9 @@ def test_an_axis_is_the_same_by_its_own_target():
     drawing = Extrinsic(X, "drawing")
     assert compare([rough], drawing).verdict == "same"
     strict = dataclasses.replace(rough, target_axes={"y": 0.001})
-    assert axes(compare([strict], drawing).differences[0], "cannot tell") == ["y"]
+    assert axes(compare([strict], drawing).differences[0], "cannot tell") == [
+        "y"
+    ]
 
 
 @pytest.mark.parametrize(
@@ -387,7 +429,11 @@ def test_an_axis_is_the_same_by_its_own_target():
             ("drive 2",),
             "moved: drive 2 differs from the others: the rotation about y by ",
         ),
-        ("0011", ("drive 3", "drive 4"), "moved: The mount has moved before drive 3: "),
+        (
+            "0011",
+            ("drive 3", "drive 4"),
+            "moved: The mount has moved before drive 3: ",
+        ),
         (
             "01",
             (),
@@ -409,7 +455,9 @@ def test_which_one_moved(have_moved, named, sentence):
 
 
 def test_files_and_python_speak_of_the_same(tmp_path):
-    changed = with_comparison(result(shift("x", 0.1), seed=1), Extrinsic(X, "drawing"))
+    changed = with_comparison(
+        result(shift("x", 0.1), seed=1), Extrinsic(X, "drawing")
+    )
     hec.save(changed, tmp_path)
     again = hec.load(tmp_path)
     assert again.comparison == changed.comparison
@@ -463,7 +511,11 @@ def saved(tmp_path, monkeypatch):
             "Mount of camera on lidar: same: a change of ",
         ),
         (["third", "--with", "robot.urdf"], 4, "moved: y by "),
-        (["flat", "--with", "first"], 3, "cannot tell about x, y and z; roll, pitch"),
+        (
+            ["flat", "--with", "first"],
+            3,
+            "cannot tell about x, y and z; roll, pitch",
+        ),
         (["first", "second"], 0, "same: both agree"),
         (
             ["first", "second", "third"],
@@ -482,9 +534,15 @@ def test_the_exit_code_is_the_verdict(saved, run, words, code, text):
 def test_json_has_it_all(saved, run):
     code, out, _ = run("compare", "third", "--with", "robot.urdf", "--json")
     document = json.loads(out)
-    assert (code, document["verdict"], document["moved"]) == (4, "moved", ["third"])
+    assert (code, document["verdict"], document["moved"]) == (
+        4,
+        "moved",
+        ["third"],
+    )
     (difference,) = document["differences"]
-    assert difference["axes"]["y"]["difference"] == pytest.approx(0.05, abs=0.01)
+    assert difference["axes"]["y"]["difference"] == pytest.approx(
+        0.05, abs=0.01
+    )
 
 
 @pytest.mark.parametrize(
@@ -539,4 +597,6 @@ def test_a_calibration_is_compared_and_stated_in_the_base_frame(saved, run):
         '<parent link="base"/>'
         in (saved / "in_base" / "extrinsic.urdf.xacro").read_text()
     )
-    assert "--frame-id base --child-frame-id camera" in run("info", "in_base")[1]
+    assert (
+        "--frame-id base --child-frame-id camera" in run("info", "in_base")[1]
+    )

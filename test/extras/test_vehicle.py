@@ -10,13 +10,23 @@ from vehicle_making import machine, pose_errors
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle import solving
 from reproduction.machines import simulate_machine
 
 # Half of what three minutes of figures of eight reach by far: x, y (m), rotations (rad).
-POSE_TOLERANCES = [0.01, 0.01, np.radians(0.15), np.radians(0.15), np.radians(0.1)]
+POSE_TOLERANCES = [
+    0.01,
+    0.01,
+    np.radians(0.15),
+    np.radians(0.15),
+    np.radians(0.1),
+]
 # Share of each parameter, rad of a steering offset.
 PARAMETER_TOLERANCE = {
     "wheels": 0.004,
@@ -37,9 +47,14 @@ def test_pose_wheels_and_clock_of_a_machine(measures):
     assert (errors < POSE_TOLERANCES).all()
     assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
     assert result.time_offset_s == pytest.approx(drive.clock_s, abs=0.008)
-    values = np.array([parameter.value for parameter in result.wheels.parameters])
+    values = np.array(
+        [parameter.value for parameter in result.wheels.parameters]
+    )
     sizes = np.array(
-        [1.0 if value == drive.parameters[2] else value for value in drive.parameters]
+        [
+            1.0 if value == drive.parameters[2] else value
+            for value in drive.parameters
+        ]
     )
     assert (
         np.abs((values - drive.parameters) / sizes).max()
@@ -49,7 +64,9 @@ def test_pose_wheels_and_clock_of_a_machine(measures):
 
 def test_without_noise_the_answer_is_exact():
     drive = machine("omni", noise=0.0)
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels, child_kind="exact"
+    )
     assert np.abs(pose_errors(result, drive.T_base_sensor)).max() < 1e-3
 
 
@@ -63,7 +80,9 @@ def test_without_wheels_y_is_out_of_reach():
 
 def test_a_prior_fills_what_is_out_of_reach():
     drive = machine()
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, prior={"z": (0.8, 0.01)})
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels, prior={"z": (0.8, 0.01)}
+    )
     assert result.out_of_reach == ()
     assert result.translation[2] == pytest.approx(0.8, abs=0.02)
 
@@ -72,7 +91,9 @@ def test_a_prior_fills_what_is_out_of_reach():
 @pytest.mark.parametrize("model", ["wheels", "omni", "tricycle", ""])
 def test_a_drive_of_one_curve_is_refused(course, model):
     drive = machine(model or "wheels", course)
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels if model else None)
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels if model else None
+    )
     assert result.verdict.value == "DO NOT USE"
     assert "x" in result.headline or "yaw" in result.headline
     assert [found.code for found in result.findings] == ["one_motion"]
@@ -82,7 +103,9 @@ def test_a_drive_of_one_curve_is_refused(course, model):
 
 def test_curves_to_one_side_make_roll_uncertain():
     drive = machine(course="left")
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels, child_kind="exact"
+    )
     errors = np.abs(pose_errors(result, drive.T_base_sensor))
     assert errors[2] > np.radians(0.1)  # the body leans outwards
     assert (errors < 3.3 * result.sigmas[[0, 1, 3, 4, 5]]).all()
@@ -91,7 +114,9 @@ def test_curves_to_one_side_make_roll_uncertain():
 @pytest.mark.parametrize("model", [*PARAMETER_TOLERANCE, ""])
 def test_spinning_on_the_spot_is_refused(model):
     drive = machine(model or "wheels", "spin")
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels if model else None)
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels if model else None
+    )
     assert result.verdict.value == "DO NOT USE"
     assert [found.code for found in result.findings] == ["one_motion"]
 
@@ -102,7 +127,9 @@ def test_spinning_on_the_spot_is_refused(model):
 )
 def test_a_speed_of_the_other_wheel_is_refused(model, wrong, course):
     drive = machine(model, course)
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, parent_measures=wrong)
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels, parent_measures=wrong
+    )
     assert result.verdict.value == "DO NOT USE"
     assert [found.code for found in result.findings] == [f"speed_of_{model}"]
 
@@ -112,12 +139,16 @@ def test_a_speed_of_the_other_wheel_is_refused(model, wrong, course):
 )
 def test_wheels_that_turn_the_other_way_need_care(change):
     drive = machine()
-    wheels = hec.wheel_trajectory(drive.stamps_ns, change(drive.values), "wheels")
+    wheels = hec.wheel_trajectory(
+        drive.stamps_ns, change(drive.values), "wheels"
+    )
     result = hec.calibrate_vehicle(drive.sensor, wheels)
     assert [found.code for found in result.findings] == ["upside_down"]
     assert result.verdict.value == "USE WITH CARE"
     confirmed = hec.calibrate_vehicle(
-        drive.sensor, wheels, prior={"roll": np.radians([result.rpy_deg[0], 10.0])}
+        drive.sensor,
+        wheels,
+        prior={"roll": np.radians([result.rpy_deg[0], 10.0])},
     )
     assert not confirmed.findings
 
@@ -127,7 +158,8 @@ def test_much_slip_needs_care():
     result = hec.calibrate_vehicle(drive.sensor, drive.wheels)
     assert result.verdict.value == "USE WITH CARE"
     assert any(
-        "the wheels or the vehicle slip" in reason.sentence for reason in result.reasons
+        "the wheels or the vehicle slip" in reason.sentence
+        for reason in result.reasons
     )
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01
 
@@ -143,7 +175,9 @@ def test_an_articulated_machine_is_no_car():
 def test_wheels_that_do_not_determine_the_clock_offset_are_refused():
     drive = simulate_machine(391507204, "articulated", "eights")
 
-    result = hec.calibrate_vehicle(drive.sensor, drive.wheels, child_kind="exact")
+    result = hec.calibrate_vehicle(
+        drive.sensor, drive.wheels, child_kind="exact"
+    )
 
     assert result.verdict is hec.Verdict.DO_NOT_USE
     assert codes_of(result.findings) == ["unrelated"]
@@ -214,7 +248,9 @@ def test_two_dimensional_poses_have_no_roll_and_pitch():
 def test_odometry_of_two_wheels_gets_multipliers():
     drive = machine()
     left, right = drive.values.T
-    nominal = np.column_stack([0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5])
+    nominal = np.column_stack(
+        [0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5]
+    )
     odometry = hec.wheel_trajectory(drive.stamps_ns, nominal, "wheel_odometry")
     result = hec.calibrate_vehicle(drive.sensor, odometry)
     radius = (drive.parameters[0] + drive.parameters[1]) / 2.0
@@ -236,7 +272,9 @@ def test_odometry_of_two_wheels_gets_multipliers():
         ("tracks", 2, ConfigError, "measures must be one of wheels, steering"),
     ],
 )
-def test_wheel_data_of_another_shape_are_refused(measures, n_columns, error, match):
+def test_wheel_data_of_another_shape_are_refused(
+    measures, n_columns, error, match
+):
     with pytest.raises(error, match=match):
         hec.wheel_trajectory(
             np.arange(3) * 20_000_000, np.ones((3, n_columns)), measures
@@ -313,7 +351,9 @@ def document_with(**options):
     drive = machine()
     try:
         return str(
-            hec.calibrate_vehicle(drive.sensor, drive.wheels, **options).to_dict()
+            hec.calibrate_vehicle(
+                drive.sensor, drive.wheels, **options
+            ).to_dict()
         )
     except NotEnoughDataError as error:
         return str(error)
@@ -380,7 +420,9 @@ def test_the_jackknife_has_the_spread_of_noise_of_shared_poses(course):
         rows = np.stack([column, values], axis=-1)[:, None]
         table = Blocks.of_rows(rows, 360)
         estimates.append(table.solve([0])[0])
-        variances.append(solving._tapered_jackknife(table, np.zeros((2, 2)))[0, 0])
+        variances.append(
+            solving._tapered_jackknife(table, np.zeros((2, 2)))[0, 0]
+        )
     sigma = np.sqrt(np.mean(variances))
     assert 0.9 < sigma / np.std(estimates) < 2.0
 
@@ -393,7 +435,9 @@ def test_an_unknown_y_is_no_lateral_acceleration():
     drive = SimpleNamespace(
         measured=lambda _: motions, ends_s=np.array([[0.0], [1.0]]), model=None
     )
-    assert solving._lateral_acceleration(drive, np.eye(4)) == pytest.approx(0, abs=1e-3)
+    assert solving._lateral_acceleration(drive, np.eye(4)) == pytest.approx(
+        0, abs=1e-3
+    )
     motions[:, 5] += 0.3
     motions[:, 0] = 0.4
     assert solving._lateral_acceleration(drive, np.eye(4)) > 0.1

@@ -49,7 +49,9 @@ def test_files_give_the_result_of_arrays(tmp_path, measures):
         of_files = hec.calibrate_vehicle(lidar, wheels)
     of_arrays = hec.calibrate_vehicle(drive.sensor, drive.wheels)
     assert of_files.parent_frame == "base_link"
-    assert of_files.T_parent_child == pytest.approx(of_arrays.T_parent_child, abs=1e-4)
+    assert of_files.T_parent_child == pytest.approx(
+        of_arrays.T_parent_child, abs=1e-4
+    )
 
 
 def test_command_line(tmp_path, capsys):
@@ -63,7 +65,9 @@ def test_command_line(tmp_path, capsys):
     assert '<parent link="base_link"/>' in urdf
     assert "MEASURE_Z_BY_HAND" in urdf
     result = hec.load(out)
-    assert result.wheels["wheel_separation"].value == pytest.approx(0.5, rel=0.1)
+    assert result.wheels["wheel_separation"].value == pytest.approx(
+        0.5, rel=0.1
+    )
     assert result.inverse().wheels == result.wheels
     report = (out / "report.html").read_text()
     assert "Pose of" in report
@@ -86,10 +90,16 @@ def test_command_line_without_wheels(tmp_path, capsys):
 def test_odometry_of_a_bag(tmp_path):
     drive = machine()
     left, right = drive.values.T
-    nominal = np.column_stack([0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5])
+    nominal = np.column_stack(
+        [0.1 * (left + right) / 2.0, 0.1 * (right - left) / 0.5]
+    )
     odometry = hec.wheel_trajectory(drive.stamps_ns, nominal, "wheel_odometry")
-    base = hec.Trajectory(odometry.stamps_ns, odometry.poses, "base_footprint", "odom")
-    lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
+    base = hec.Trajectory(
+        odometry.stamps_ns, odometry.poses, "base_footprint", "odom"
+    )
+    lidar = hec.Trajectory(
+        drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map"
+    )
     bag = tmp_path / "bag"
     with rosbag2.Writer(
         bag, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
@@ -99,7 +109,12 @@ def test_odometry_of_a_bag(tmp_path):
             writer, {"/odom": (base, type_), "/lidar": (lidar, type_)}, "mcap"
         )
     arguments = ["--parent-topic", "/odom", "--child-topic", "/lidar"]
-    arguments += ["--parent-measures", "wheel_odometry", "--out", str(tmp_path / "out")]
+    arguments += [
+        "--parent-measures",
+        "wheel_odometry",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(["calibrate", str(bag), *arguments]) == 0
     result = hec.load(tmp_path / "out")
     assert result.parent_frame == "base_footprint"
@@ -108,14 +123,22 @@ def test_odometry_of_a_bag(tmp_path):
 
 def write_wheel_bag(path, type_, topic, messages, drive):
     """Write messages at the stamps of the wheels, and the odometry of the lidar."""
-    lidar = hec.Trajectory(drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map")
+    lidar = hec.Trajectory(
+        drive.sensor.stamps_ns, drive.sensor.poses, "lidar", "map"
+    )
     with rosbag2.Writer(
         path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
     ) as writer:
-        write_streams(writer, {"/lidar": (lidar, "nav_msgs/msg/Odometry")}, "mcap")
+        write_streams(
+            writer, {"/lidar": (lidar, "nav_msgs/msg/Odometry")}, "mcap"
+        )
         connection = writer.add_connection(topic, type_, typestore=JAZZY)
-        for stamp_ns, message in zip(drive.stamps_ns.tolist(), messages, strict=True):
-            writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, type_))
+        for stamp_ns, message in zip(
+            drive.stamps_ns.tolist(), messages, strict=True
+        ):
+            writer.write(
+                connection, stamp_ns, JAZZY.serialize_cdr(message, type_)
+            )
 
 
 def header(stamp_ns):
@@ -159,10 +182,20 @@ def test_joint_states_of_a_bag(tmp_path, capsys, names, fields, has_velocity):
     drive = machine()
     bag = tmp_path / "bag"
     messages = joint_states(drive, names, has_velocity)
-    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
-    arguments = ["--parent-topic", f"/joint_states{fields}", "--child-topic", "/lidar"]
+    write_wheel_bag(
+        bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive
+    )
+    arguments = [
+        "--parent-topic",
+        f"/joint_states{fields}",
+        "--child-topic",
+        "/lidar",
+    ]
     assert (
-        main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+        main(
+            ["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]
+        )
+        == 0
     )
     assert names[0] in capsys.readouterr().err
     result = hec.load(tmp_path / "out")
@@ -175,9 +208,13 @@ def test_joint_states_without_wheels_are_refused(tmp_path, capsys):
     drive = machine()
     bag = tmp_path / "bag"
     messages = joint_states(drive, ["joint_1", "joint_2"], True)
-    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    write_wheel_bag(
+        bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive
+    )
     assert main(["calibrate", str(bag), "--parent-topic", "/joint_states"]) == 1
-    assert "name the joints: /joint_states?LEFT,RIGHT" in capsys.readouterr().err
+    assert (
+        "name the joints: /joint_states?LEFT,RIGHT" in capsys.readouterr().err
+    )
 
 
 def car_states(drive, wheel_names, steering_names):
@@ -190,7 +227,9 @@ def car_states(drive, wheel_names, steering_names):
         drive.stamps_ns.tolist(), drive.values, strict=True
     ):
         tangent = np.tan(angle)
-        angles = [float(np.arctan(tangent / (1.0 + side * tangent))) for side in sides]
+        angles = [
+            float(np.arctan(tangent / (1.0 + side * tangent))) for side in sides
+        ]
         positions = np.array([0.0] * len(wheel_names) + angles)
         velocities = np.array([speed] * len(wheel_names) + [0.0] * n_steered)
         yield kind(header(stamp_ns), names, positions, velocities, np.zeros(0))
@@ -215,8 +254,15 @@ def test_joint_states_of_a_steered_vehicle(
     drive = machine(measures)
     bag = tmp_path / "bag"
     messages = car_states(drive, wheels, steering)
-    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
-    arguments = ["--parent-topic", f"/joint_states{fields}", "--child-topic", "/lidar"]
+    write_wheel_bag(
+        bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive
+    )
+    arguments = [
+        "--parent-topic",
+        f"/joint_states{fields}",
+        "--child-topic",
+        "/lidar",
+    ]
     arguments += ["--parent-measures", measures, "--out", str(tmp_path / "out")]
     assert main(["calibrate", str(bag), *arguments]) == 0
     result = hec.load(tmp_path / "out")
@@ -229,8 +275,12 @@ def test_joint_states_of_a_steered_vehicle(
 def test_joint_states_of_a_steered_vehicle_need_the_kind(tmp_path, capsys):
     drive = machine("steering")
     bag = tmp_path / "bag"
-    messages = car_states(drive, ["rear_left_wheel", "rear_right_wheel"], ["steer"])
-    write_wheel_bag(bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive)
+    messages = car_states(
+        drive, ["rear_left_wheel", "rear_right_wheel"], ["steer"]
+    )
+    write_wheel_bag(
+        bag, "sensor_msgs/msg/JointState", "/joint_states", messages, drive
+    )
     arguments = ["--parent-topic", "/joint_states", "--child-topic", "/lidar"]
     assert main(["calibrate", str(bag), *arguments]) == 1
     assert (
@@ -242,7 +292,9 @@ def test_joint_states_of_a_steered_vehicle_need_the_kind(tmp_path, capsys):
 def test_angles_of_a_steered_axle():
     for angle in (-0.6, -0.1, -0.001, 0.0, 0.02, 0.3, 0.8):
         tangent = np.tan(angle)
-        wheels = [np.arctan(tangent / (1.0 + side * tangent)) for side in (-0.3, 0.3)]
+        wheels = [
+            np.arctan(tangent / (1.0 + side * tangent)) for side in (-0.3, 0.3)
+        ]
         assert middle_angle(wheels) == pytest.approx(angle, rel=1e-3)
     # Noise of both wheels has opposite signs where the wheels are straight.
     assert middle_angle([0.002, -0.0019]) == pytest.approx(0.00005)
@@ -257,8 +309,13 @@ def test_velocities_without_stamps_are_refused(tmp_path, capsys):
     messages = [speed] * len(drive.stamps_ns)
     write_wheel_bag(bag, "geometry_msgs/msg/Twist", "/cmd_vel", messages, drive)
     arguments = ["--parent-topic", "/cmd_vel", "--child-topic", "/lidar"]
-    assert main(["calibrate", str(bag), *arguments, "--parent-measures", "omni"]) == 1
-    assert "it has no stamps, and is usually a command" in capsys.readouterr().err
+    assert (
+        main(["calibrate", str(bag), *arguments, "--parent-measures", "omni"])
+        == 1
+    )
+    assert (
+        "it has no stamps, and is usually a command" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -275,7 +332,9 @@ def test_units_in_the_names_of_columns(tmp_path, header, units):
     values = np.array([[1.0, 2.0], [3.0, 4.0], [2.0, 1.0]])
     path = tmp_path / "wheels.csv"
     rows = np.column_stack([stamps_ns * 1e-9, values])
-    np.savetxt(path, rows, fmt="%.6f", delimiter=",", header=header, comments="")
+    np.savetxt(
+        path, rows, fmt="%.6f", delimiter=",", header=header, comments=""
+    )
     with pytest.warns(UserWarning, match="by its columns"):
         read = hec.read_trajectory(path)
     expected = hec.wheel_trajectory(stamps_ns, values * units, read.measures)
@@ -301,11 +360,17 @@ def test_live_messages_have_the_poses_of_a_bag(tmp_path, model):
     messages = [*twists(drive)] if model == "omni" else []
     if not messages:
         type_ = "sensor_msgs/msg/JointState"
-        messages = [*car_states(drive, ["rear_wheel"], ["left_steer", "right_steer"])]
+        messages = [
+            *car_states(drive, ["rear_wheel"], ["left_steer", "right_steer"])
+        ]
     write_wheel_bag(tmp_path / "bag", type_, "/wheels", messages, drive)
-    in_bag = hec.read_trajectory(tmp_path / "bag", topic="/wheels", measures=model)
+    in_bag = hec.read_trajectory(
+        tmp_path / "bag", topic="/wheels", measures=model
+    )
     read = live_reading(type_, "/wheels", model)
-    live = [read(bytes(JAZZY.serialize_cdr(message, type_))) for message in messages]
+    live = [
+        read(bytes(JAZZY.serialize_cdr(message, type_))) for message in messages
+    ]
     assert [pose.stamp_ns for pose in live] == in_bag.stamps_ns.tolist()
     positions = np.array([pose.position for pose in live])
     assert positions == pytest.approx(in_bag.poses[:, :3, 3], abs=1e-8)
@@ -315,7 +380,9 @@ def test_twists_of_a_bag(tmp_path):
     drive = machine("omni")
     messages = [*twists(drive)]
     bag = tmp_path / "bag"
-    write_wheel_bag(bag, "geometry_msgs/msg/TwistStamped", "/twist", messages, drive)
+    write_wheel_bag(
+        bag, "geometry_msgs/msg/TwistStamped", "/twist", messages, drive
+    )
     arguments = [
         "--parent-topic",
         "/twist",
@@ -325,7 +392,10 @@ def test_twists_of_a_bag(tmp_path):
         "omni",
     ]
     assert (
-        main(["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]) == 0
+        main(
+            ["calibrate", str(bag), *arguments, "--out", str(tmp_path / "out")]
+        )
+        == 0
     )
     result = hec.load(tmp_path / "out")
     assert np.abs(pose_errors(result, drive.T_base_sensor))[:2].max() < 0.01

@@ -7,8 +7,14 @@ import yaml
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.extras.vehicle import kinds
-from hand_eye_calib.extras.vehicle.controllers import controller_of, controller_text
-from hand_eye_calib.extras.vehicle.parameters import VehicleParameter, VehicleParameters
+from hand_eye_calib.extras.vehicle.controllers import (
+    controller_of,
+    controller_text,
+)
+from hand_eye_calib.extras.vehicle.parameters import (
+    VehicleParameter,
+    VehicleParameters,
+)
 from hand_eye_calib.extras.vehicle.wheels import MODELS
 from reproduction.machines import simulate_machine
 
@@ -45,7 +51,9 @@ CONTROLLER = {
 
 
 def wheels_of(measures, values, **nominal):
-    parameters = map(VehicleParameter, MODELS[measures].names, values, [0.001] * 3)
+    parameters = map(
+        VehicleParameter, MODELS[measures].names, values, [0.001] * 3
+    )
     return VehicleParameters(tuple(parameters), 0.0, measures, **nominal)
 
 
@@ -72,9 +80,16 @@ def driven(forward, turns):
 
 
 def diff_drive(parameters, rates, seconds):
-    left_m = parameters["left_wheel_radius_multiplier"] * parameters["wheel_radius"]
-    right_m = parameters["right_wheel_radius_multiplier"] * parameters["wheel_radius"]
-    track_m = parameters["wheel_separation_multiplier"] * parameters["wheel_separation"]
+    left_m = (
+        parameters["left_wheel_radius_multiplier"] * parameters["wheel_radius"]
+    )
+    right_m = (
+        parameters["right_wheel_radius_multiplier"] * parameters["wheel_radius"]
+    )
+    track_m = (
+        parameters["wheel_separation_multiplier"]
+        * parameters["wheel_separation"]
+    )
     left, right = rates.T * seconds * [[left_m], [right_m]]
     return driven((left + right) / 2, (right - left) / track_m)
 
@@ -121,17 +136,23 @@ def exact_wheels(measures, parameters, speed, yaw_rate):
             [(speed - half_turn) / first, (speed + half_turn) / second]
         )
     angle = np.arctan2(second * yaw_rate, speed)
-    rolled = np.hypot(speed, second * yaw_rate) if measures == "tricycle" else speed
+    rolled = (
+        np.hypot(speed, second * yaw_rate) if measures == "tricycle" else speed
+    )
     # The speeds of these machines are in m/s: turn them to rates of wheels of 0.3 m.
     return np.column_stack([rolled / first / 0.3, angle + last])
 
 
 @pytest.mark.parametrize("measures", DRAWINGS)
-def test_a_controller_with_these_parameters_drives_the_true_path(tmp_path, measures):
+def test_a_controller_with_these_parameters_drives_the_true_path(
+    tmp_path, measures
+):
     simulated, drawing = DRAWINGS[measures]
     drive = simulate_machine(23, measures, duration_s=120.0)
     unit = 1.0 if measures == "wheels" else np.array([1.0 / 0.3, 1.0])
-    wheels = hec.wheel_trajectory(drive.stamps_ns, drive.values * unit, measures)
+    wheels = hec.wheel_trajectory(
+        drive.stamps_ns, drive.values * unit, measures
+    )
     result = hec.calibrate_vehicle(drive.sensor, wheels)
     hec.save(result, tmp_path)
     (node,) = yaml.safe_load(
@@ -142,11 +163,15 @@ def test_a_controller_with_these_parameters_drives_the_true_path(tmp_path, measu
     yaw_rate = 0.4 * np.sin(times_s / 3.0) + 0.05
     rates = exact_wheels(measures, drive.parameters, speed, yaw_rate)
     # The driver subtracts the offset of the steering angle.
-    offset = result.wheels["steering_offset"].value if measures != "wheels" else 0.0
+    offset = (
+        result.wheels["steering_offset"].value if measures != "wheels" else 0.0
+    )
     truth = driven(speed * 0.02, yaw_rate * 0.02)
     by_drawing = simulated(drawing, rates, 0.02)
     calibrated = simulated(node["ros__parameters"], rates - [0.0, offset], 0.02)
-    errors = [np.abs(path - truth).max(axis=0) for path in (by_drawing, calibrated)]
+    errors = [
+        np.abs(path - truth).max(axis=0) for path in (by_drawing, calibrated)
+    ]
     position_errors_m = [max(error[:2]) for error in errors]
     heading_errors = [error[2] for error in errors]
     assert position_errors_m[0] > 2.0  # on a path of a hundred metres
@@ -171,9 +196,13 @@ def test_a_bend_of_the_odometry_becomes_a_multiplier_of_each_wheel():
         "wheel_separation_multiplier": 1.0,
     }
     expected = diff_drive(nominal | truth, rates, 0.1)
-    assert diff_drive(nominal | values, rates, 0.1) == pytest.approx(expected, abs=1e-9)
+    assert diff_drive(nominal | values, rates, 0.1) == pytest.approx(
+        expected, abs=1e-9
+    )
     # Without the track, the file states what is missing.
-    text = controller_text(wheels_of("wheel_odometry", [1.0, 1.0, curvature]), "USE")
+    text = controller_text(
+        wheels_of("wheel_odometry", [1.0, 1.0, curvature]), "USE"
+    )
     assert "--nominal-separation" in text
 
 
@@ -198,13 +227,17 @@ DRIVE = simulate_machine(29, duration_s=90.0)
 
 
 def result_of(factor=1.0, **options):
-    wheels = hec.wheel_trajectory(DRIVE.stamps_ns, DRIVE.values * factor, "wheels")
+    wheels = hec.wheel_trajectory(
+        DRIVE.stamps_ns, DRIVE.values * factor, "wheels"
+    )
     return hec.calibrate_vehicle(DRIVE.sensor, wheels, **options)
 
 
 def test_the_radius_is_in_the_headline():
     result = result_of(nominal_radius=0.1)
-    assert f"wheel radius {np.mean(DRIVE.parameters[:2]):.3f}" in result.headline
+    assert (
+        f"wheel radius {np.mean(DRIVE.parameters[:2]):.3f}" in result.headline
+    )
     assert not {"unusual_radius", "radius_not_nominal"} & {
         item.code for item in result.findings
     }
@@ -228,16 +261,24 @@ def test_revolutions_per_minute_are_doubted():
     ids=["TurtleBot", "large wheel in rpm", "small wheel in revolutions"],
 )
 def test_a_radius_is_judged_beside_the_track(radius, separation, is_doubted):
-    findings = kinds._check_size(wheels_of("wheels", [radius, radius, separation]))
+    findings = kinds._check_size(
+        wheels_of("wheels", [radius, radius, separation])
+    )
     assert [item.code for item in findings] == ["unusual_radius"] * is_doubted
 
 
 @pytest.mark.parametrize("measures", ["wheel_odometry", "omni"])
-@pytest.mark.parametrize(("multiplier", "is_doubted"), [(1.05, False), (0.8, True)])
-def test_odometry_is_compared_with_the_nominal_radius(measures, multiplier, is_doubted):
+@pytest.mark.parametrize(
+    ("multiplier", "is_doubted"), [(1.05, False), (0.8, True)]
+)
+def test_odometry_is_compared_with_the_nominal_radius(
+    measures, multiplier, is_doubted
+):
     wheels = wheels_of(measures, [multiplier, 1.0, 1.0], nominal_radius_m=0.1)
     findings = kinds._check_size(wheels)
-    assert [item.code for item in findings] == ["radius_not_nominal"] * is_doubted
+    assert [item.code for item in findings] == [
+        "radius_not_nominal"
+    ] * is_doubted
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,9 @@ STREAMS = {
         bag_making.ODOMETRY,
     ),
     "/b": (
-        as_trajectory(child_of(POSES), sensor_frame="camera", world_frame="odom"),
+        as_trajectory(
+            child_of(POSES), sensor_frame="camera", world_frame="odom"
+        ),
         bag_making.POSE_STAMPED,
     ),
 }
@@ -85,7 +87,14 @@ def read(path):
 
 def replay(path, capsys):
     """Exit code and JSON document or None; a code without a document has one line of an error."""
-    options = [*TOPICS, "--child-frame", "camera", "--reference", "B5", "--json"]
+    options = [
+        *TOPICS,
+        "--child-frame",
+        "camera",
+        "--reference",
+        "B5",
+        "--json",
+    ]
     code = main(["replay", str(path), *options])
     out, err = capsys.readouterr()
     if not out:
@@ -138,20 +147,26 @@ def test_a_bit_flipped_anywhere(bag, capsys):
         damaged[place] ^= 1 << bit
         path.write_bytes(damaged)
         poses, _ = read(path)
-        if poses is not None and sorted(stamped(poses)) == sorted(stamped(whole)):
+        if poses is not None and sorted(stamped(poses)) == sorted(
+            stamped(whole)
+        ):
             continue  # the engine gets what it got before
         harmed += 1
         document = replay(path, capsys)
         if document is not None and not document["warnings"]:
             matrix = document["T_parent_child"]["matrix"]
-            assert_allclose(matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place))
+            assert_allclose(
+                matrix, T_PARENT_CHILD, atol=UNNOTICED, err_msg=str(place)
+            )
     assert harmed >= 10
 
 
 # ---- files cut off, in chunks, and without an index
 
 STAMPS_NS = 1_000 + 100_000_007 * np.arange(4000)
-LONG = Trajectory(STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000, 6))))
+LONG = Trajectory(
+    STAMPS_NS, se3.exp(np.random.default_rng(1).normal(size=(4000, 6)))
+)
 LONG = dict.fromkeys(STREAMS, (LONG, bag_making.ODOMETRY))
 
 
@@ -174,7 +189,8 @@ def test_a_bag_cut_off_gives_what_came_before(tmp_path, kind):
         assert recovered == whole[: len(recovered)]
         assert re.search(r"truncated or damaged .* lost", warning)
         assert re.search(
-            rf"{len(recovered)} messages over [0-9.]+ s were recovered$", warning
+            rf"{len(recovered)} messages over [0-9.]+ s were recovered$",
+            warning,
         )
 
 
@@ -213,12 +229,21 @@ def test_mcap_files_without_parts_of_an_index_are_whole(tmp_path, options):
         ids = {}
         for schema, channel, message in make_reader(whole).iter_messages():
             if channel.id not in ids:
-                key = writer.register_schema(schema.name, schema.encoding, schema.data)
-                ids[channel.id] = writer.register_channel(channel.topic, "cdr", key)
+                key = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+                ids[channel.id] = writer.register_channel(
+                    channel.topic, "cdr", key
+                )
             times = message.log_time, message.publish_time
-            writer.add_message(ids[channel.id], times[0], message.data, times[1])
+            writer.add_message(
+                ids[channel.id], times[0], message.data, times[1]
+            )
         writer.finish()
-    assert read(tmp_path / "a.mcap") == (bag_making.all_poses(tmp_path / "bag"), [])
+    assert read(tmp_path / "a.mcap") == (
+        bag_making.all_poses(tmp_path / "bag"),
+        [],
+    )
 
 
 def test_without_the_library_mcap_whole_files_are_read(tmp_path, monkeypatch):
@@ -260,7 +285,9 @@ def test_paths_that_are_no_bag(tmp_path):
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00\x07\x00\x00" + b"\x00" * 100])
-def test_a_message_that_is_too_short_or_strangely_encoded_is_named(tmp_path, data):
+def test_a_message_that_is_too_short_or_strangely_encoded_is_named(
+    tmp_path, data
+):
     with_message(tmp_path / "bag", "sqlite3", data)
     message = "/a: a message of type nav_msgs/msg/Odometry cannot be read .*expected plain CDR"
     with pytest.raises(InputError, match=message):
@@ -297,7 +324,9 @@ def with_message(path, kind, data):
     with rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
         write_streams(writer, STREAMS, kind)
         connection = next(
-            connection for connection in writer.connections if connection.topic == "/a"
+            connection
+            for connection in writer.connections
+            if connection.topic == "/a"
         )
         writer.write(connection, int(STREAMS["/a"][0].stamps_ns[-1]) + 1, data)
     return path
@@ -311,11 +340,15 @@ def rosbag1_bomb(path):
     with writer:
         write_streams(writer, STREAMS, "rosbag1")
         connection = next(
-            connection for connection in writer.connections if connection.topic == "/a"
+            connection
+            for connection in writer.connections
+            if connection.topic == "/a"
         )
         last_ns = int(STREAMS["/a"][0].stamps_ns[-1])
         writer.write(
-            connection, last_ns + 1, memoryview(np.zeros(700 * MIB, dtype=np.uint8))
+            connection,
+            last_ns + 1,
+            memoryview(np.zeros(700 * MIB, dtype=np.uint8)),
         )
     return path
 
@@ -365,8 +398,12 @@ def test_a_time_that_is_none_costs_its_message_or_gives_one_line(
 ):
     write_bag(tmp_path / "bag", STREAMS, storage="sqlite3")
     with sqlite3.connect(bag_making.storage_file(tmp_path / "bag")) as database:
-        database.execute(f"UPDATE messages SET timestamp = {time} WHERE id = 41")
-    code = main(["calibrate", str(tmp_path / "bag"), *TOPICS, "--method", "dnlo"])
+        database.execute(
+            f"UPDATE messages SET timestamp = {time} WHERE id = 41"
+        )
+    code = main(
+        ["calibrate", str(tmp_path / "bag"), *TOPICS, "--method", "dnlo"]
+    )
     notes = capsys.readouterr().err
     if time == "'text'":
         assert code == 1

@@ -44,15 +44,23 @@ def bag_of(path, storage, kind, header_of):
     """A bag recorded at STAMPS_NS, whose child has other header stamps."""
     recorded = []
     for bag_ns, header_ns, parent, child in zip(
-        STAMPS_NS.tolist(), header_of(STAMPS_NS).tolist(), POSES, CHILD, strict=True
+        STAMPS_NS.tolist(),
+        header_of(STAMPS_NS).tolist(),
+        POSES,
+        CHILD,
+        strict=True,
     ):
-        make = pose_message(ODOMETRY, bag_ns, se3.to_rows(parent), "map", "lidar")
+        make = pose_message(
+            ODOMETRY, bag_ns, se3.to_rows(parent), "map", "lidar"
+        )
         recorded.append((bag_ns, "/a", ODOMETRY, make))
         if kind == TF:
             make = tf_message([(header_ns, "odom", "camera", child)])
             recorded.append((bag_ns, "/tf", TF, make))
         else:
-            make = pose_message(kind, header_ns, se3.to_rows(child), "odom", "camera")
+            make = pose_message(
+                kind, header_ns, se3.to_rows(child), "odom", "camera"
+            )
             recorded.append((bag_ns, "/b", kind, make))
     return write_messages(path, recorded, storage)
 
@@ -71,7 +79,8 @@ def test_header_stamps_of_0_are_named_and_the_recorders_times_are_taken_if_asked
     path = bag_of(bag_path(tmp_path, storage), storage, kind, zeros)
     source = "odom:camera" if kind == TF else "/b"
     with pytest.raises(
-        InputError, match=r"300 of 300 header stamps are 0. .*`child_stamps` rec"
+        InputError,
+        match=r"300 of 300 header stamps are 0. .*`child_stamps` rec",
     ):
         read(path, source)
     rows, warnings = read(path, source, stamps={"child": "receive"})
@@ -90,7 +99,9 @@ def test_whole_seconds_are_named(tmp_path, storage):
     assert rows.stamps_ns.tolist() == STAMPS_NS.tolist()
 
 
-def test_a_simulation_may_begin_at_0_and_a_slow_stream_may_have_whole_seconds(tmp_path):
+def test_a_simulation_may_begin_at_0_and_a_slow_stream_may_have_whole_seconds(
+    tmp_path,
+):
     recorded = []
     for second, pose in enumerate(POSES[:40]):
         stamp_ns = second * 10**9
@@ -100,7 +111,9 @@ def test_a_simulation_may_begin_at_0_and_a_slow_stream_may_have_whole_seconds(tm
     with PoseBag(path) as bag:
         trajectory, _ = bag.trajectory("/a")
         assert bag.warnings == []
-    assert trajectory.stamps_ns.tolist() == [second * 10**9 for second in range(40)]
+    assert trajectory.stamps_ns.tolist() == [
+        second * 10**9 for second in range(40)
+    ]
 
 
 def test_a_few_stamps_of_0_are_left_out_and_counted(tmp_path):
@@ -112,12 +125,16 @@ def test_a_few_stamps_of_0_are_left_out_and_counted(tmp_path):
 
     path = bag_of(tmp_path / "bag", "mcap", ODOMETRY, some_zero)
     rows, warnings = read(path, "/b")
-    assert rows.stamps_ns.tolist() == np.delete(STAMPS_NS, (3, 4, 5, 90)).tolist()
+    assert (
+        rows.stamps_ns.tolist() == np.delete(STAMPS_NS, (3, 4, 5, 90)).tolist()
+    )
     assert warnings == ["/b: 4 poses were left out: their header stamps are 0"]
 
 
 @pytest.mark.parametrize("option", ["--stamps", "--child-stamps"])
-def test_the_command_takes_the_recorders_times_if_asked(tmp_path, capsys, option):
+def test_the_command_takes_the_recorders_times_if_asked(
+    tmp_path, capsys, option
+):
     path = bag_of(tmp_path / "bag", "sqlite3", ODOMETRY, zeros)
     assert main(["calibrate", str(path), *TOPICS]) == 1
     error = capsys.readouterr().err
@@ -127,15 +144,22 @@ def test_the_command_takes_the_recorders_times_if_asked(tmp_path, capsys, option
     assert "--child-stamps receive" in capsys.readouterr().err
     main(["calibrate", str(path), *TOPICS, option, "receive", "--json"])
     document = json.loads(capsys.readouterr().out)
-    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
     assert main(["check", str(path), *TOPICS[:4], option, "receive"]) in (0, 1)
     assert "header stamps" not in capsys.readouterr().err
 
 
 def test_a_path_has_no_times_of_receipt(tmp_path):
     make = path_message(STAMPS_NS, POSES)
-    path = write_messages(tmp_path / "bag", [(int(STAMPS_NS[-1]), "/path", PATH, make)])
-    with PoseBag(path) as bag, pytest.raises(ConfigError, match=r"received as a whole"):
+    path = write_messages(
+        tmp_path / "bag", [(int(STAMPS_NS[-1]), "/path", PATH, make)]
+    )
+    with (
+        PoseBag(path) as bag,
+        pytest.raises(ConfigError, match=r"received as a whole"),
+    ):
         bag.trajectory("/path", stamps="receive")
 
 

@@ -40,7 +40,9 @@ from hand_eye_calib.formats.bags.writer import (
 SECOND = 10**9
 POSES = wandering_poses(120)
 PARENT = as_trajectory(POSES, sensor_frame="lidar", world_frame="map")
-CHILD = as_trajectory(child_of(POSES)[:90], sensor_frame="camera", world_frame="odom")
+CHILD = as_trajectory(
+    child_of(POSES)[:90], sensor_frame="camera", world_frame="odom"
+)
 STREAMS = {"/a": (PARENT, ODOMETRY), "/b": (CHILD, POSE_STAMPED)}
 
 
@@ -74,8 +76,12 @@ def test_poses_come_back_in_the_order_of_time_with_exact_stamps_and_frames(
         ("child", CHILD, ("odom", None)),
     ):
         of_stream = [pose for pose in poses if pose.stream == stream]
-        assert [pose.stamp_ns for pose in of_stream] == source.stamps_ns.tolist()
-        assert {(pose.world_frame, pose.sensor_frame) for pose in of_stream} == {frames}
+        assert [
+            pose.stamp_ns for pose in of_stream
+        ] == source.stamps_ns.tolist()
+        assert {
+            (pose.world_frame, pose.sensor_frame) for pose in of_stream
+        } == {frames}
         values = [pose.pose for pose in of_stream]
         quats_xyzw = se3.to_quat_xyzw(source.poses)
         assert_array_equal(values, np.c_[source.poses[:, :3, 3], quats_xyzw])
@@ -91,7 +97,9 @@ def with_others(path, *others):
     ) as writer:
         write_streams(writer, STREAMS, "mcap")
         for topic, message_type, make in others:
-            connection = writer.add_connection(topic, message_type, typestore=JAZZY)
+            connection = writer.add_connection(
+                topic, message_type, typestore=JAZZY
+            )
             data = JAZZY.serialize_cdr(make(JAZZY), message_type)
             writer.write(connection, int(PARENT.stamps_ns[3]), data)
     return path
@@ -105,7 +113,9 @@ LOG = (
 
 
 def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
-    path = with_others(tmp_path / "others", LOG, ("/path", PATH, path_message([], [])))
+    path = with_others(
+        tmp_path / "others", LOG, ("/path", PATH, path_message([], []))
+    )
     assert all_poses(path) == all_poses(new_bag())
     with PoseBag(path) as bag:
         assert bag.select() == ("/a", "/b")
@@ -113,7 +123,9 @@ def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
             ("/a", ODOMETRY, 120),
             ("/b", POSE_STAMPED, 90),
         ]
-        assert str(bag.topics["/log"]) == "/log (std_msgs/msg/String, 1 messages)"
+        assert (
+            str(bag.topics["/log"]) == "/log (std_msgs/msg/String, 1 messages)"
+        )
 
 
 @pytest.mark.parametrize(
@@ -125,9 +137,13 @@ def test_topics_are_listed_and_others_do_not_get_in_the_way(tmp_path, new_bag):
     ],
 )
 def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
-    goal = {"/goal_pose": (PARENT[:1], POSE_STAMPED)}  # published once: no sensor
+    goal = {
+        "/goal_pose": (PARENT[:1], POSE_STAMPED)
+    }  # published once: no sensor
     for streams in (STREAMS, STREAMS | goal):
-        with PoseBag(new_bag(streams=streams, name=f"bag{len(streams)}")) as bag:
+        with PoseBag(
+            new_bag(streams=streams, name=f"bag{len(streams)}")
+        ) as bag:
             assert bag.select(*named) == selected
 
 
@@ -142,7 +158,9 @@ def test_two_pose_topics_leave_no_choice(new_bag, named, selected):
         (("/a", "/a"), "parent and child topic are both /a"),
     ],
 )
-def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, message):
+def test_a_wrong_topic_is_answered_with_those_that_are_there(
+    tmp_path, named, message
+):
     with (
         PoseBag(with_others(tmp_path / "bag", LOG)) as bag,
         pytest.raises(InputError, match=message) as caught,
@@ -164,7 +182,9 @@ def test_a_wrong_topic_is_answered_with_those_that_are_there(tmp_path, named, me
         (3, "3 topics have poses: /odom_0 .*, /odom_1 .* and /odom_2 "),
     ],
 )
-def test_without_names_there_must_be_an_obvious_pair_of_topics(new_bag, count, message):
+def test_without_names_there_must_be_an_obvious_pair_of_topics(
+    new_bag, count, message
+):
     path = new_bag(
         streams={f"/odom_{number}": STREAMS["/a"] for number in range(count)}
     )
@@ -189,13 +209,17 @@ def test_several_publishers_and_types_on_one_topic(tmp_path):
             text = NOETIC.types["std_msgs/msg/String"]("hello")
             message = message if second_type == ODOMETRY else text
             writer.write(
-                connection, stamp_ns, NOETIC.serialize_ros1(message, second_type)
+                connection,
+                stamp_ns,
+                NOETIC.serialize_ros1(message, second_type),
             )
     poses = all_poses(tmp_path / "one.bag")
     assert sum(pose.stream == "parent" for pose in poses) == len(PARENT) + 1
     with (
         PoseBag(tmp_path / "two.bag") as bag,
-        pytest.raises(InputError, match="topic /a of .* has type several types"),
+        pytest.raises(
+            InputError, match="topic /a of .* has type several types"
+        ),
     ):
         bag.select("/a", "/b")
 
@@ -208,7 +232,9 @@ def transforms(moving, static=()):
     messages = [
         (stamp_ns, "/tf", TF, tf_message([(stamp_ns, parent, child, matrix)]))
         for child, parent, trajectory in moving
-        for stamp_ns, matrix in zip(trajectory.stamps_ns, trajectory.poses, strict=True)
+        for stamp_ns, matrix in zip(
+            trajectory.stamps_ns, trajectory.poses, strict=True
+        )
     ]
     edges = [(0, parent, child, matrix) for child, parent, matrix in static]
     before_ns = int(PARENT.stamps_ns[0]) - 1
@@ -238,7 +264,9 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     trajectory = hec.read_trajectory(path, topic="map:lidar")
     stamps_ns = slow.stamps_ns[slow.stamps_ns <= PARENT.stamps_ns[-1]]
     expected = (
-        slow.poses[: len(stamps_ns)] @ PARENT.at(stamps_ns, straight=True) @ MOUNT
+        slow.poses[: len(stamps_ns)]
+        @ PARENT.at(stamps_ns, straight=True)
+        @ MOUNT
     )
     assert_same_motion(trajectory, stamps_ns, expected)
     assert (trajectory.world_frame, trajectory.sensor_frame) == ("map", "lidar")
@@ -246,7 +274,9 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
     other = hec.read_trajectory(path, topic="odom:lidar")
     assert_same_motion(other, PARENT.stamps_ns, PARENT.poses @ MOUNT)
     backwards = hec.read_trajectory(path, topic="lidar:odom")
-    assert_same_motion(backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT))
+    assert_same_motion(
+        backwards, PARENT.stamps_ns, se3.inverse(PARENT.poses @ MOUNT)
+    )
     message = (
         r"transform lidar:rear: it does not move, because all of its transforms are static; it has "
         r"base:lidar \(static\), base:rear \(static\), map:odom"
@@ -258,19 +288,29 @@ def test_a_chain_of_moving_and_static_transforms(tmp_path, storage):
 def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
     old = "tf/msg/tfMessage"
     messages = [
-        (stamp_ns, "/tf", old, tf_message([(stamp_ns, "/odom", "/base", matrix)], old))
+        (
+            stamp_ns,
+            "/tf",
+            old,
+            tf_message([(stamp_ns, "/odom", "/base", matrix)], old),
+        )
         for stamp_ns, matrix in zip(PARENT.stamps_ns, PARENT.poses, strict=True)
     ]
     path = write_messages(tmp_path / "old.bag", messages * 2, "rosbag1")
     assert_same_motion(
-        hec.read_trajectory(path, topic="odom:base"), PARENT.stamps_ns, PARENT.poses
+        hec.read_trajectory(path, topic="odom:base"),
+        PARENT.stamps_ns,
+        PARENT.poses,
     )
 
 
 @pytest.mark.parametrize(
     ("edges", "message"),
     [
-        (["base odom"], r"no frame 'lidar' in the bag's transforms; it has odom:base"),
+        (
+            ["base odom"],
+            r"no frame 'lidar' in the bag's transforms; it has odom:base",
+        ),
         (
             ["lidar base", "odom map"],
             "'odom' and 'lidar' are not connected; it has base:lidar, m",
@@ -291,7 +331,11 @@ def test_old_transforms_with_slashes_and_of_the_old_type_count_once(tmp_path):
 )
 def test_transforms_that_do_not_lead_there(tmp_path, new_bag, edges, message):
     moving = [(*edge.split(), PARENT) for edge in edges]
-    path = write_messages(tmp_path / "tf", transforms(moving)) if edges else new_bag()
+    path = (
+        write_messages(tmp_path / "tf", transforms(moving))
+        if edges
+        else new_bag()
+    )
     with pytest.raises(InputError, match=message) as caught:
         hec.read_trajectory(path, topic="odom:lidar")
     assert "\n" not in str(caught.value)
@@ -316,11 +360,18 @@ def test_a_growing_path_is_its_newest_message(tmp_path, storage):
 
 
 def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
-    without = (SECOND, "/path", PATH, path_message(np.zeros(5, dtype=int), POSES[:5]))
+    without = (
+        SECOND,
+        "/path",
+        PATH,
+        path_message(np.zeros(5, dtype=int), POSES[:5]),
+    )
     path = write_messages(
         tmp_path / "bag", [without, (SECOND, "/p", PATH, path_message([], []))]
     )
-    with pytest.raises(InputError, match="the poses of path /path have no stamps"):
+    with pytest.raises(
+        InputError, match="the poses of path /path have no stamps"
+    ):
         hec.read_trajectory(path, topic="/path")
     with pytest.raises(InputError, match="no poses on /p of"):
         hec.read_trajectory(path, topic="/p")
@@ -332,13 +383,24 @@ def test_a_path_whose_poses_have_no_stamps_is_refused(tmp_path):
 @pytest.mark.parametrize("storage", STORAGES)
 def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
     paths = []
-    for number, rows in enumerate([slice(80, 120), slice(0, 40), slice(40, 80)]):
-        streams = {"/a": (PARENT[rows], ODOMETRY), "/b": (PARENT[rows], ODOMETRY)}
+    for number, rows in enumerate(
+        [slice(80, 120), slice(0, 40), slice(40, 80)]
+    ):
+        streams = {
+            "/a": (PARENT[rows], ODOMETRY),
+            "/b": (PARENT[rows], ODOMETRY),
+        }
         paths.append(new_bag(storage, streams, f"part{number}"))
     with PoseBag(*paths) as bag:
         poses = poses_of(bag)
-        assert [*bag.topics.values()] == [("/a", ODOMETRY, 120), ("/b", ODOMETRY, 120)]
-        assert (bag.start_ns, bag.end_ns) == (PARENT.stamps_ns[0], PARENT.stamps_ns[-1])
+        assert [*bag.topics.values()] == [
+            ("/a", ODOMETRY, 120),
+            ("/b", ODOMETRY, 120),
+        ]
+        assert (bag.start_ns, bag.end_ns) == (
+            PARENT.stamps_ns[0],
+            PARENT.stamps_ns[-1],
+        )
     assert [
         pose.stamp_ns for pose in poses if pose.stream == "parent"
     ] == PARENT.stamps_ns.tolist()
@@ -346,7 +408,9 @@ def test_the_parts_of_a_drive_are_read_in_the_order_of_time(new_bag, storage):
 
 def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
     lidar = new_bag("rosbag1", {"/a": STREAMS["/a"]}, "lidar")
-    with PoseBag(lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")) as bag:
+    with PoseBag(
+        lidar, new_bag("mcap", {"/b": STREAMS["/b"]}, "camera")
+    ) as bag:
         assert bag.select() == ("/a", "/b")
         poses = poses_of(bag)
     assert [pose.bag_ns for pose in poses] == sorted(
@@ -356,7 +420,9 @@ def test_bags_of_one_sensor_each_are_read_side_by_side(new_bag):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("mode", ["STORAGE", "MESSAGE", "FILE", None])
-def test_compressed_bags_and_their_files_alone(tmp_path, new_bag, storage, mode):
+def test_compressed_bags_and_their_files_alone(
+    tmp_path, new_bag, storage, mode
+):
     if (storage, mode) == ("sqlite3", "STORAGE"):
         pytest.skip("only mcap has chunks to compress")
     expected = all_poses(new_bag(storage, name="plain"))
@@ -404,10 +470,13 @@ def test_a_stamp_that_jumps_against_the_bags_own_time_is_left_out(tmp_path):
         ((_, message),) = stamped_messages(
             JAZZY.types, jumping, ODOMETRY, is_ros1=False
         )
-        messages.append((bag_ns, "/a", ODOMETRY, lambda _, message=message: message))
+        messages.append(
+            (bag_ns, "/a", ODOMETRY, lambda _, message=message: message)
+        )
     path = write_messages(tmp_path / "bag", messages)
     with pytest.warns(
-        UserWarning, match="/a: 1 poses were left out: their stamps jump away from"
+        UserWarning,
+        match="/a: 1 poses were left out: their stamps jump away from",
     ):
         trajectory = hec.read_trajectory(path, topic="/a")
     rest = np.arange(120) != 30
@@ -439,8 +508,12 @@ def test_bags_of_other_programs_read_or_are_refused_in_one_line():
     for path in paths:
         try:
             with PoseBag(path) as bag:
-                counts = {topic.name: topic.count for topic in bag.topics.values()}
-                n_messages = sum(len(run.messages) for run in bag.runs([*counts]))
+                counts = {
+                    topic.name: topic.count for topic in bag.topics.values()
+                }
+                n_messages = sum(
+                    len(run.messages) for run in bag.runs([*counts])
+                )
                 assert n_messages == sum(counts.values())
         except InputError as error:
             refused[path.name] = str(error)

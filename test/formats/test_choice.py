@@ -69,7 +69,10 @@ def test_the_stream_that_is_not_named_is_chosen_alone():
             [LIDAR, CAMERA, ("/imu_link/odometry", ODOMETRY, 600)],
             (),
             "3 topics have poses: /lidar/odometry ",
-            {"parent_topic": "/lidar/odometry", "child_topic": "/camera/odometry"},
+            {
+                "parent_topic": "/lidar/odometry",
+                "child_topic": "/camera/odometry",
+            },
         ),
         (
             [("/cam/image_raw", IMAGE, 900)],
@@ -159,7 +162,9 @@ def test_without_an_obvious_pair_the_error_names_cause_and_options(
         ),
     ],
 )
-def test_beside_a_named_topic_the_error_names_the_other_stream(rows, message, options):
+def test_beside_a_named_topic_the_error_names_the_other_stream(
+    rows, message, options
+):
     with pytest.raises(UnclearStreamsError) as caught:
         chosen(rows, missing=("child",))
     assert str(caught.value).startswith(message)

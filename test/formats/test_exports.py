@@ -57,7 +57,10 @@ CASES = [
 
 def result(parent="imu", child="camera", **changes):
     return good_calibration(
-        parent_frame=parent, child_frame=child, time_offset_s=OFFSET_S, **changes
+        parent_frame=parent,
+        child_frame=child,
+        time_offset_s=OFFSET_S,
+        **changes,
     )
 
 
@@ -236,11 +239,15 @@ def test_a_file_maps_a_point_as_it_says_and_reads_back(
     file.write_text(text)
     pose_between = open_installed(str(file))
     installed = pose_between(parent, child)
-    assert_allclose(installed.T_parent_child, calibration.T_parent_child, atol=1e-9)
+    assert_allclose(
+        installed.T_parent_child, calibration.T_parent_child, atol=1e-9
+    )
     # These two formats name no frames.
     if name not in ("opencv", "numpy"):
         installed = pose_between(child, parent)
-        assert_allclose(installed.T_parent_child, calibration.T_child_parent, atol=1e-9)
+        assert_allclose(
+            installed.T_parent_child, calibration.T_child_parent, atol=1e-9
+        )
 
 
 def test_every_format_is_tried():
@@ -257,10 +264,28 @@ def test_every_format_is_tried():
         ("openvins", "imu", "cam0", ("cam0", "timeshift_cam_imu"), OFFSET_S),
         ("vins", "cam0", "imu", ("td",), -OFFSET_S),
         # t_lidar = t_imu - offset
-        ("fast_lio", "imu", "lidar", ("common", "time_offset_lidar_to_imu"), OFFSET_S),
-        ("fast_livo2", "lidar", "imu", ("time_offset", "imu_time_offset"), -OFFSET_S),
+        (
+            "fast_lio",
+            "imu",
+            "lidar",
+            ("common", "time_offset_lidar_to_imu"),
+            OFFSET_S,
+        ),
+        (
+            "fast_livo2",
+            "lidar",
+            "imu",
+            ("time_offset", "imu_time_offset"),
+            -OFFSET_S,
+        ),
         # t_lidar = t_image + offset
-        ("fast_livo2", "lidar", "camera", ("time_offset", "img_time_offset"), OFFSET_S),
+        (
+            "fast_livo2",
+            "lidar",
+            "camera",
+            ("time_offset", "img_time_offset"),
+            OFFSET_S,
+        ),
         (
             "fast_livo2",
             "camera",
@@ -289,19 +314,25 @@ def test_px4_has_its_own_axes_and_a_delay():
     )
     values = [float(lines[f"EKF2_EV_POS_{axis}"]) for axis in "XYZ"]
     assert values == pytest.approx([x, -y, -z])
-    assert "EKF2_EV_DELAY" not in lines  # the camera's clock is behind: no delay
+    assert (
+        "EKF2_EV_DELAY" not in lines
+    )  # the camera's clock is behind: no delay
     late = good_calibration(
         parent_frame="base_link", child_frame="vio", time_offset_s=-0.05
     )
     assert "param set EKF2_EV_DELAY 50.0\n" in late.export("px4")
-    antenna = result("base_link", "gnss_antenna", **unknown("roll", "pitch", "yaw"))
+    antenna = result(
+        "base_link", "gnss_antenna", **unknown("roll", "pitch", "yaw")
+    )
     assert f"param set EKF2_GPS_POS_Y {-y:.12f}" in antenna.export("px4")
 
 
 def test_an_axis_that_is_not_known_is_refused():
     flat = result("base_link", "lidar", **unknown("z"))
     for name in EXPORT_FORMATS:
-        with pytest.raises(InputError, match="does not determine z; .* with a prior"):
+        with pytest.raises(
+            InputError, match="does not determine z; .* with a prior"
+        ):
             flat.export(name)
     with pytest.raises(
         ConfigError, match="unknown format 'kalbir'; known are autoware"
@@ -349,7 +380,9 @@ def test_what_the_names_do_not_say_is_assumed_and_said():
         ),
     ],
 )
-def test_a_file_that_does_not_say_it_is_refused_in_one_line(text, message, tmp_path):
+def test_a_file_that_does_not_say_it_is_refused_in_one_line(
+    text, message, tmp_path
+):
     path = tmp_path / "foreign.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as error:
@@ -364,19 +397,28 @@ def test_of_several_cameras_the_named_one_is_read(tmp_path):
     path = tmp_path / "camchain.yaml"
     path.write_text(
         yaml.safe_dump(
-            {"cam0": {"T_cam_imu": identity}, "cam1": {"T_cam_imu": moved.tolist()}}
+            {
+                "cam0": {"T_cam_imu": identity},
+                "cam1": {"T_cam_imu": moved.tolist()},
+            }
         )
     )
     T_parent_child = open_installed(str(path))("imu", "cam1").T_parent_child
     assert_allclose(T_parent_child, se3.inverse(moved))
-    with pytest.raises(InputError, match="it has several extrinsics, and the names"):
+    with pytest.raises(
+        InputError, match="it has several extrinsics, and the names"
+    ):
         open_installed(str(path))("imu", "lidar")
 
 
 def test_the_parsers_of_others_read_the_same(tmp_path):
     cv2 = pytest.importorskip("cv2")
     calibration = result("imu", "camera")
-    keys = {"opencv": "T_parent_child", "vins": "body_T_cam0", "orbslam3": "IMU.T_b_c1"}
+    keys = {
+        "opencv": "T_parent_child",
+        "vins": "body_T_cam0",
+        "orbslam3": "IMU.T_b_c1",
+    }
     for name, key in keys.items():
         path = tmp_path / f"{name}.yaml"
         path.write_text(calibration.export(name))
@@ -389,7 +431,10 @@ def test_the_parsers_of_others_read_the_same(tmp_path):
     path.write_text(calibration.export("openvins"))
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     rows = storage.getNode("cam0").getNode("T_imu_cam")
-    T = [[rows.at(row).at(column).real() for column in range(4)] for row in range(4)]
+    T = [
+        [rows.at(row).at(column).real() for column in range(4)]
+        for row in range(4)
+    ]
     assert_allclose(T, calibration.T_parent_child, atol=1e-9)
 
 
@@ -402,7 +447,9 @@ def test_urdf_and_colmap_read_the_same(tmp_path):
     links = '<link name="base_link"/><link name="camera"/>'
     path = tmp_path / "robot.urdf"
     path.write_text(
-        joint.replace("<robot", '<robot name="r"').replace("<joint", links + "<joint")
+        joint.replace("<robot", '<robot name="r"').replace(
+            "<joint", links + "<joint"
+        )
     )
     T = yourdfpy.URDF.load(str(path)).get_transform("camera", "base_link")
     assert_allclose(T, calibration.T_parent_child, atol=1e-9)
@@ -463,13 +510,16 @@ def shown(page):
         time_offset_sigma_s=0.0002,
     )
     text, count = SHOWN.subn(
-        lambda match: f"{match[1]}{calibration.export(match[2])}```", page.read_text()
+        lambda match: f"{match[1]}{calibration.export(match[2])}```",
+        page.read_text(),
     )
     assert count == 1
     return text
 
 
-@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page", sorted(DOCS.glob("*.md")), ids=lambda page: page.stem
+)
 def test_pages_show_what_the_program_writes(page):
     version = re.compile(r"(?<=by hand_eye_calib )[\w.+]+(?=\. )")
     assert version.sub("", page.read_text()) == version.sub("", shown(page))

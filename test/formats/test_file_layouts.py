@@ -7,21 +7,33 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
-from motions import as_trajectory, geodetic, read_trajectory_file, wandering_poses
+from motions import (
+    as_trajectory,
+    geodetic,
+    read_trajectory_file,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
-from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
+from hand_eye_calib.formats.trajectory_files.reading import (
+    read_trajectory_files,
+)
 
 N = 60
 START_NS = 1_700_000_000_250_000_000
 # Away from the identity, so that no column is 0 or 1 by chance.
 AWAY = se3.exp(np.array([3.0, -2.0, 1.0, 0.4, -0.9, 0.7]))
-TRUTH = as_trajectory(AWAY @ wandering_poses(N), rate_hz=20.0, start_ns=START_NS)
+TRUTH = as_trajectory(
+    AWAY @ wandering_poses(N), rate_hz=20.0, start_ns=START_NS
+)
 STAMPS_NS = TRUTH.stamps_ns.tolist()
 
 
@@ -47,9 +59,13 @@ def parts_of(poses):
 def weeks_and_seconds():
     """Week of GPS and second of the week of every pose."""
     week_ns = 604_800_000_000_000
-    since_1980_ns = [stamp_ns - 315_964_800_000_000_000 for stamp_ns in STAMPS_NS]
+    since_1980_ns = [
+        stamp_ns - 315_964_800_000_000_000 for stamp_ns in STAMPS_NS
+    ]
     weeks = [stamp_ns // week_ns for stamp_ns in since_1980_ns]
-    return weeks, [f"{stamp_ns % week_ns / 1e9:.3f}" for stamp_ns in since_1980_ns]
+    return weeks, [
+        f"{stamp_ns % week_ns / 1e9:.3f}" for stamp_ns in since_1980_ns
+    ]
 
 
 P, R, Q, WXYZ, ROWS, COLUMNS, MATRIX, TRANSPOSED = parts_of(TRUTH.poses)
@@ -58,12 +74,16 @@ RPY_DEG = Rotation.from_matrix(R).as_euler("xyz", degrees=True)
 # A place south of the equator and west of Greenwich.
 LAT, LON, HEIGHT = geodetic(P - P[0], (-33.5, -70.25, 600.0))
 COVARIANCE = np.tile(np.linspace(0.0, 0.35, 36), (N, 1))
-SECONDS = [f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}" for stamp_ns in STAMPS_NS]
+SECONDS = [
+    f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}" for stamp_ns in STAMPS_NS
+]
 WEEKS, SOW = weeks_and_seconds()
 
 
 def dates(form):
-    moments = [datetime.fromtimestamp(stamp_ns // 10**9, UTC) for stamp_ns in STAMPS_NS]
+    moments = [
+        datetime.fromtimestamp(stamp_ns // 10**9, UTC) for stamp_ns in STAMPS_NS
+    ]
     texts = [moment.strftime(form) for moment in moments]
     return [
         text.replace("mmm", f"{stamp_ns % 10**9 // 10**6:03d}")
@@ -80,7 +100,8 @@ def text_of(*columns, head="", separator=" ", decimals="{:.12g}"):
                 row.append(str(value))
             else:
                 row += [
-                    decimals.format(number) for number in np.atleast_1d(value).ravel()
+                    decimals.format(number)
+                    for number in np.atleast_1d(value).ravel()
                 ]
     return head + "".join(separator.join(row) + "\n" for row in cells)
 
@@ -116,11 +137,13 @@ ROS_NAMES = (
     + "\n"
 )
 QUOTED = '"t","x, east","pos_y","z","qx","qy","qz","qw"\n'
-PROSE = (
-    "Project:     demo\nProgram:     Version 8.90.2428\n\nDatum:       WGS84, ITRF\n\n"
+PROSE = "Project:     demo\nProgram:     Version 8.90.2428\n\nDatum:       WGS84, ITRF\n\n"
+INS_NAMES = (
+    "Remarks: 2023 11 14\n\n   Time  Easting  Northing  H-Ell  qx  qy  qz  qw\n"
 )
-INS_NAMES = "Remarks: 2023 11 14\n\n   Time  Easting  Northing  H-Ell  qx  qy  qz  qw\n"
-WITH_UNITS = f"{INS_NAMES}  (sec)   (mm)   (mm)   (mm)   (-)   (-)   (-)   (-)\n"
+WITH_UNITS = (
+    f"{INS_NAMES}  (sec)   (mm)   (mm)   (mm)   (-)   (-)   (-)   (-)\n"
+)
 ZERO_BASED = [f"T_{row}{column}" for row in range(3) for column in range(4)]
 IN_BRACKETS = [f"T[{row}][{column}]" for row in range(4) for column in range(4)]
 ONE_BASED = [f"r{row}{column}" for row in "123" for column in "123"]
@@ -317,17 +340,22 @@ GPS = {
 @pytest.mark.parametrize("form", GPS)
 def test_a_week_of_gps_and_its_second_are_stamps(tmp_path, form):
     names, *columns = GPS[form]
-    text = text_of(*columns, P, Q, head=f"{names},x,y,z,qx,qy,qz,qw\n", separator=",")
+    text = text_of(
+        *columns, P, Q, head=f"{names},x,y,z,qx,qy,qz,qw\n", separator=","
+    )
     reading = read(written(tmp_path / "ins.csv", text))
     assert_is_the_truth(reading.trajectory)
     assert any("18 s ahead of UTC" in guess for guess in reading.guesses)
 
 
-@pytest.mark.parametrize("name", ["itow", "tow_ms", "ms_of_week", ".navpvt.iTOW"])
+@pytest.mark.parametrize(
+    "name", ["itow", "tow_ms", "ms_of_week", ".navpvt.iTOW"]
+)
 def test_milliseconds_of_a_week_are_stamps_without_the_week(tmp_path, name):
     head = f"{name},x,y,z,qx,qy,qz,qw\n"
     path = written(
-        tmp_path / "ins.csv", text_of(MS_OF_WEEK, P, Q, head=head, separator=",")
+        tmp_path / "ins.csv",
+        text_of(MS_OF_WEEK, P, Q, head=head, separator=","),
     )
     week_ns = 604_800_000_000_000
     of_week_ns = (TRUTH.stamps_ns - 315_964_800_000_000_000) % week_ns
@@ -347,8 +375,12 @@ def test_a_table_keeps_the_unit_of_the_second_of_a_week():
     assert_array_equal(trajectory.stamps_ns, TRUTH.stamps_ns)
 
 
-@pytest.mark.parametrize(("period_s", "name"), [(604_800, "sow"), (86_400, "time")])
-def test_stamps_go_on_where_a_week_or_a_day_begins_again(tmp_path, period_s, name):
+@pytest.mark.parametrize(
+    ("period_s", "name"), [(604_800, "sow"), (86_400, "time")]
+)
+def test_stamps_go_on_where_a_week_or_a_day_begins_again(
+    tmp_path, period_s, name
+):
     since_start = np.arange(N) * 0.05
     stamps = np.mod(period_s - 1.0 + since_start, period_s)
     text = text_of(stamps, P, Q, head=f"{name},{NAMES[2:]}", separator=",")
@@ -381,7 +413,9 @@ NO_POSE = {
 
 @pytest.mark.parametrize("kind", NO_POSE)
 @pytest.mark.parametrize("separator", [" ", ",", ";"])
-def test_rows_without_a_pose_are_left_out_and_counted(tmp_path, kind, separator):
+def test_rows_without_a_pose_are_left_out_and_counted(
+    tmp_path, kind, separator
+):
     if kind == "empty" and separator == " ":
         pytest.skip("blanks separate no empty cells")
     lines = text_of(SECONDS, P, Q, separator=separator).splitlines()
@@ -415,14 +449,16 @@ def test_many_rows_without_a_pose_are_warned_of(tmp_path, capsys):
     main(["calibrate", str(whole), str(lost), "--method", "park"])
     printed = "".join(capsys.readouterr())
     assert "lost.tum: 8 of 60 poses (13%) were left out" in printed
-    assert "This is a large share: check whether the source loses track" in " ".join(
-        printed.split()
+    assert (
+        "This is a large share: check whether the source loses track"
+        in " ".join(printed.split())
     )
 
 
 def test_a_file_without_any_pose_is_one_line(tmp_path):
     path = written(
-        tmp_path / "a.tum", "\n".join(f"{k} nan nan nan 0 0 0 1" for k in range(9))
+        tmp_path / "a.tum",
+        "\n".join(f"{k} nan nan nan 0 0 0 1" for k in range(9)),
     )
     with pytest.raises(
         InputError,
@@ -441,7 +477,8 @@ def test_rows_that_are_paired_are_left_out_of_both_files(tmp_path):
     lines[0][3] = "nan nan nan nan nan nan nan"
     lines[1][20] = "0 0 0 0 0 0 0"
     files = [
-        written(tmp_path / f"{k}.txt", "\n".join(rows)) for k, rows in enumerate(lines)
+        written(tmp_path / f"{k}.txt", "\n".join(rows))
+        for k, rows in enumerate(lines)
     ]
     options = FileOptions(format=AUTO, pair_by="row")
     readings = read_trajectory_files([(file, options) for file in files])
@@ -456,13 +493,19 @@ def test_arrays_with_nan_and_transposed_matrices():
     times = TRUTH.stamps_ns / 1e9
     with pytest.warns(UserWarning, match="1 of 60 poses"):
         trajectory = hec.read_trajectory(poses, times=times)
-    assert_allclose(trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12)
+    assert_allclose(
+        trajectory.poses, np.delete(TRUTH.poses, 5, axis=0), atol=1e-12
+    )
     with pytest.warns(UserWarning, match="matrices are transposed"):
-        trajectory = hec.read_trajectory(np.swapaxes(TRUTH.poses, 1, 2), times=times)
+        trajectory = hec.read_trajectory(
+            np.swapaxes(TRUTH.poses, 1, 2), times=times
+        )
     assert_allclose(trajectory.poses, TRUTH.poses, atol=1e-12)
     poses = TRUTH.poses.copy()
     poses[:, 3, 3] = 2.0
-    with pytest.raises(InputError, match="the last row of a matrix is not 0 0 0 1"):
+    with pytest.raises(
+        InputError, match="the last row of a matrix is not 0 0 0 1"
+    ):
         hec.read_trajectory(poses, times=times)
 
 
@@ -490,7 +533,10 @@ def test_stamps_without_their_last_digits_are_refused(tmp_path, form):
 def test_whole_seconds_of_a_slow_stream_and_repeated_lines_are_right(tmp_path):
     slow = [str(START_NS // 10**9 + k) for k in range(N)]
     assert (
-        len(read(written(tmp_path / "slow.tum", text_of(slow, P, Q))).trajectory) == N
+        len(
+            read(written(tmp_path / "slow.tum", text_of(slow, P, Q))).trajectory
+        )
+        == N
     )
     twice = "".join(
         line + line for line in text_of(SECONDS, P, Q).splitlines(keepends=True)
@@ -541,7 +587,9 @@ def test_what_cannot_be_read_gets_one_line(tmp_path, kind):
 
 
 HOSTILE = {
-    "header of brackets": "t,x[" + " " * 600 + ",y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
+    "header of brackets": "t,x["
+    + " " * 600
+    + ",y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
     "long header of brackets": "t,x" + "[(" * 30_000 + "\n0,1\n",
     "long header of blanks": "t,x[" + " " * 60_000 + "]]\n0,1\n",
     "long number": "1" * 60_000 + "x,1,2,3,0,0,0,1\n",
@@ -599,4 +647,8 @@ def test_a_stamp_in_degrees_has_the_unit_of_its_size(tmp_path):
     with pytest.warns(UserWarning, match="positions only"):
         trajectory = hec.read_trajectory(path, "auto")
 
-    assert trajectory.stamps_ns.tolist() == [500_000_000, 1_500_000_000, 2_500_000_000]
+    assert trajectory.stamps_ns.tolist() == [
+        500_000_000,
+        1_500_000_000,
+        2_500_000_000,
+    ]

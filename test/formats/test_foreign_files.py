@@ -13,7 +13,12 @@ from operator import xor
 
 import numpy as np
 import pytest
-from motions import as_trajectory, geodetic, read_trajectory_file, wandering_poses
+from motions import (
+    as_trajectory,
+    geodetic,
+    read_trajectory_file,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -37,7 +42,10 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def dates(form):
-    return [datetime.fromtimestamp(seconds, UTC).strftime(form) for seconds in SECONDS]
+    return [
+        datetime.fromtimestamp(seconds, UTC).strftime(form)
+        for seconds in SECONDS
+    ]
 
 
 def joined(rows, separator=" "):
@@ -47,7 +55,8 @@ def joined(rows, separator=" "):
 def of_nmea(damaged=3):
     """After a logger's own stamps, one sentence with a wrong checksum."""
     lat, lon = (
-        [100 * (angle // 1) + angle % 1 * 60 for angle in deg] for deg in (LAT, LON)
+        [100 * (angle // 1) + angle % 1 * 60 for angle in deg]
+        for deg in (LAT, LON)
     )
     texts = [
         f"GPRMC,{clock[:-4]},A,,,,,,,{day},,|GNGGA,{clock[:-4]},{lat[k]:014.9f},N,"
@@ -61,7 +70,9 @@ def of_nmea(damaged=3):
     checks = [reduce(xor, sentence.encode()) for sentence in lines]
     checks[2 * damaged + 1] ^= 1
     rows = zip(lines, checks, strict=True)
-    return "".join(f"12:00:00 ${sentence}*{check:02X}\r\n" for sentence, check in rows)
+    return "".join(
+        f"12:00:00 ${sentence}*{check:02X}\r\n" for sentence, check in rows
+    )
 
 
 def of_gpx():
@@ -80,7 +91,10 @@ def of_rtklib(weeks=False):
     times = dates("%Y/%m/%d %H:%M:%S.%f")
     if weeks:
         since = SECONDS - 315_964_800
-        times = [f"{int(second // 604_800)} {second % 604_800:.3f}" for second in since]
+        times = [
+            f"{int(second // 604_800)} {second % 604_800:.3f}"
+            for second in since
+        ]
     head = "% program   : RTKPOST\n%  GPST   latitude(deg) longitude(deg)  height(m)   Q  ns\n"
     degrees = ([f"{value:.12f}" for value in values] for values in (LAT, LON))
     rows = zip(times, *degrees, HEIGHT, [1] * N, [9] * N, strict=True)
@@ -90,7 +104,8 @@ def of_rtklib(weeks=False):
 def of_colmap():
     rows = se3.to_rows(se3.inverse(TRUTH.poses))[::-1, [6, 3, 4, 5, 0, 1, 2]]
     names = [
-        f"cam 0/{stamp}.png\n1.5 2.5 -1 3.5 4.5 7" for stamp in TRUTH.stamps_ns[::-1]
+        f"cam 0/{stamp}.png\n1.5 2.5 -1 3.5 4.5 7"
+        for stamp in TRUTH.stamps_ns[::-1]
     ]
     head = (
         "# Image list with two lines of data per image:\n"
@@ -132,7 +147,9 @@ def of_vicon(turn="RX,RY,RZ", units="rad,rad,rad", bodies=("drone:drone",)):
         for k in range(n)
         for component in (Q if "RW" in turn else VECTORS, P * 1e3 * (k + 1))
     ]
-    return of_rows(f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses)
+    return of_rows(
+        f"{head},{f',{units},mm,mm,mm' * n}\n", range(N), [0] * N, *poses
+    )
 
 
 def of_novatel(short=False):
@@ -143,7 +160,11 @@ def of_novatel(short=False):
     if not short:
         head = "#INSPVAXA,COM1,0,7.5,FINESTEERING,{0},{1:.3f},0,4e77,4;INS_SOLUTION_GOOD,INS_PSRSP,"
         body = "{:.12f},{:.12f},{:.9f},45.0,1,2,3,"
-    angles = Rotation.from_quat(Q).as_euler("ZYX", degrees=True) * [-1, -1, 1] + [
+    angles = Rotation.from_quat(Q).as_euler("ZYX", degrees=True) * [
+        -1,
+        -1,
+        1,
+    ] + [
         90,
         0,
         0,
@@ -155,7 +176,11 @@ def of_novatel(short=False):
             ".0,", ",", 1
         )
         log += body.format(lat, lon, height - (0 if short else 45.0))
-        log += "{2:.9f},{1:.9f},{0:.9f},3*e877c178\n#TIMEA,COM1;VALID*1\n".format(*turn)
+        log += (
+            "{2:.9f},{1:.9f},{0:.9f},3*e877c178\n#TIMEA,COM1;VALID*1\n".format(
+                *turn
+            )
+        )
     return log
 
 
@@ -164,14 +189,17 @@ def of_lio_sam():
     head = f"# .PCD v0.7\nFIELDS {names}\nSIZE 4 4 4 4 4 4 4 8\nTYPE{' F' * 8}\nPOINTS {N}\n"
     angles = Rotation.from_quat(Q).as_euler("xyz")
     zeros = np.zeros(N)
-    return of_rows(f"{head}DATA ascii\n", P, zeros, angles, SECONDS, separator=" ")
+    return of_rows(
+        f"{head}DATA ascii\n", P, zeros, angles, SECONDS, separator=" "
+    )
 
 
 def of_rows(header, *values, separator=","):
     """Numbers below a header, each value (N, ...) one or several columns."""
     columns = [np.reshape(array, (N, -1)).tolist() for array in values]
     rows = (
-        [cell for cells in row for cell in cells] for row in zip(*columns, strict=True)
+        [cell for cells in row for cell in cells]
+        for row in zip(*columns, strict=True)
     )
     return header + joined(rows, separator)
 
@@ -183,12 +211,18 @@ def of_echo(frames="odom,base"):
         for stamp_ns in TRUTH.stamps_ns.tolist()
     )
     return joined(
-        ([stamp, frames, *p, *q] for stamp, p, q in zip(stamps, P, Q, strict=True)), ","
+        (
+            [stamp, frames, *p, *q]
+            for stamp, p, q in zip(stamps, P, Q, strict=True)
+        ),
+        ",",
     )
 
 
 def of_nuscenes():
-    values = zip((STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True)
+    values = zip(
+        (STAMPS // 1000).tolist(), WXYZ.tolist(), P.tolist(), strict=True
+    )
     keys = ("timestamp", "rotation", "translation")
     return json.dumps(
         [dict(zip(keys, row, strict=True)) for row in values][::-1], indent=1
@@ -201,9 +235,7 @@ POSE = "tx,ty,tz,qx,qy,qz,qw\n"
 DATES = [f"{date}Z" for date in dates("%Y-%m-%dT%H:%M:%S.%f")]
 MATRICES = TRUTH.poses.reshape(N, 16)
 WITH_UNITS = "# by hand\n# time [{0}],x [{1}],y [{1}],z [{1}],q_w,q_x,q_y,q_z\n"
-EUROC = (
-    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
-)
+EUROC = "#timestamp [ns],p_RS_R_x [m],p_RS_R_y,p_RS_R_z,q_RS_w [],q_RS_x,q_RS_y,q_RS_z\n"
 ROT = "Stamp [ns],Pos_X [m],Pos_Y,Pos_Z,rot_w,rot_x,rot_y,rot_z\n"
 OKVIS = "timestamp, p_WS_W_x, p_WS_W_y, p_WS_W_z, q_WS_x, q_WS_y, q_WS_z, q_WS_w, v_WS_W_x\n"
 ULOG2CSV = "timestamp,position[0],position[1],position[2],q[0],q[1],q[2],q[3]\n"
@@ -211,16 +243,26 @@ ARM = "t,x_ft,y_ft,z_ft,rotvec_x,rotvec_y,rotvec_z\n"
 ARIA = "graph_uid,tracking_timestamp_us,utc_timestamp_ns," + ",".join(
     f"{name}_world_device" for name in POSE.strip().split(",")
 )
-HEADER = f"__time,/odom/header/stamp,{POSE}".replace(",t", ",/odom/pose/pose/position/")
+HEADER = f"__time,/odom/header/stamp,{POSE}".replace(
+    ",t", ",/odom/pose/pose/position/"
+)
 TCP = " ".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))])
-UNITS = "Device Time,Easting,Northing,H-Ell,qw,qx,qy,qz\n(ns),(mm),(mm),(mm),,,,\n"
+UNITS = (
+    "Device Time,Easting,Northing,H-Ell,qw,qx,qy,qz\n(ns),(mm),(mm),(mm),,,,\n"
+)
 GNSS_POSES = (
     "# frame_id (timestamp in ns), translation (t_x, t_y, "
     "t_z), rotation (q_x, q_y, q_z, q_w)"
 )
 FORMATS = {
     "tum": (
-        of_rows("# of a program of eight words or so\n", SECONDS, P, Q, separator=" "),
+        of_rows(
+            "# of a program of eight words or so\n",
+            SECONDS,
+            P,
+            Q,
+            separator=" ",
+        ),
         "",
     ),
     "ids": (
@@ -270,7 +312,10 @@ FORMATS = {
         of_rows(f"{TCP}\n", SECONDS, P, VECTORS, separator=" "),
         "read in rad",
     ),
-    "aria": (of_rows(f"{ARIA}\n", ["ea72"] * N, STAMPS // 1000, STAMPS + 9, P, Q), ""),
+    "aria": (
+        of_rows(f"{ARIA}\n", ["ea72"] * N, STAMPS // 1000, STAMPS + 9, P, Q),
+        "",
+    ),
     "stamp_of_the_header": (of_rows(HEADER, SECONDS + 0.1, SECONDS, P, Q), ""),
     "ulog2csv": (of_rows(ULOG2CSV, STAMPS // 1000, P, WXYZ), ""),
     "okvis": (of_rows(OKVIS, STAMPS, P, Q, P[:, :1], separator=", "), ""),
@@ -285,12 +330,18 @@ FORMATS = {
         "is read as format euroc",
     ),
     "kitti": (of_rows("", MATRICES[:, :12], separator=" "), "stamps read from"),
-    "stamp_and_rows": (of_rows("", STAMPS, MATRICES[:, :12]), "is read as format csv"),
+    "stamp_and_rows": (
+        of_rows("", STAMPS, MATRICES[:, :12]),
+        "is read as format csv",
+    ),
     "stamp_and_matrix": (of_rows("", SECONDS, MATRICES, separator=" "), ""),
     "echo": (of_echo(), ""),
     "echo_of_poses": (of_echo("map"), ""),
     "nuscenes": (of_nuscenes(), ""),
-    "vicon_quaternions": (of_vicon("RX,RY,RZ,RW", ",,,"), "read as quaternions"),
+    "vicon_quaternions": (
+        of_vicon("RX,RY,RZ,RW", ",,,"),
+        "read as quaternions",
+    ),
     "colmap": (of_colmap(), ""),
     "nerfstudio": (of_nerfstudio(), "not those of OpenGL"),
     "motive": (of_motive(), "rigid body drone"),
@@ -311,7 +362,9 @@ def calibrated(parent, child):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path, name):
+def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(
+    tmp_path, name
+):
     text, note = FORMATS[name]
     path = tmp_path / "anything.txt"
     path.write_bytes(text.encode())
@@ -319,14 +372,18 @@ def test_every_format_and_unit_gives_the_same_poses_and_the_same_answer(tmp_path
     file = read_trajectory_file(path, AUTO)
     trajectory = file.trajectory
     start_ns = TRUTH.stamps_ns[0] if name.startswith("vicon") else 0
-    assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0)
+    assert_allclose(
+        trajectory.stamps_ns, TRUTH.stamps_ns - start_ns, atol=2000, rtol=0
+    )
     expected = TRUTH.poses.copy()
     if trajectory.measures == "positions":
         expected[:, :3, :3] = np.eye(3)
         expected[:, :3, 3] = P - P[0]
     assert_allclose(trajectory.poses, expected, atol=2e-6)
     assert note in " ".join(file.guesses)
-    assert trajectory.measures == ("positions" if name in [*FORMATS][-5:] else "poses")
+    assert trajectory.measures == (
+        "positions" if name in [*FORMATS][-5:] else "poses"
+    )
     if trajectory.measures == "poses":
         child = Trajectory(trajectory.stamps_ns, TRUTH.poses @ MOUNT)
         assert_allclose(calibrated(trajectory, child), MOUNT, atol=1e-6)
@@ -352,13 +409,19 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(
         of_nerfstudio(names[:4:-1], (TRUTH.poses @ MOUNT)[:4:-1])
     )
     for name, poses in (("a", TRUTH.poses), ("b", TRUTH.poses @ MOUNT)):
-        rows = {"kitti": poses[:, :3].reshape(-1, 12), "all": poses.reshape(-1, 16)}
+        rows = {
+            "kitti": poses[:, :3].reshape(-1, 12),
+            "all": poses.reshape(-1, 16),
+        }
         for kind, values in (rows | {"seven": se3.to_rows(poses)}).items():
             (tmp_path / f"{name}.{kind}").write_text(joined(values))
         np.save(tmp_path / f"{name}.npy", poses)
     for kind in ("json", "kitti", "all", "seven", "npy"):
         by = "name" if kind == "json" else "row"
-        command = ["calibrate", *(str(tmp_path / f"{name}.{kind}") for name in "ab")]
+        command = [
+            "calibrate",
+            *(str(tmp_path / f"{name}.{kind}") for name in "ab"),
+        ]
         assert main([*command, "--pair-by", by, "--json"]) in (0, 3)
         document = json.loads(capsys.readouterr().out)
         assert (document["parent_frame"], document["child_frame"]) == ("a", "b")
@@ -384,7 +447,9 @@ def test_poses_without_stamps_are_paired_by_row_or_by_the_names_of_images(
     assert main(kitti) == 1
     err = capsys.readouterr().err
     assert "no name of an image is in all files" in err
-    assert re.search(r"names found: 0 in \S+ and 0 in \S+; pair by time or row", err)
+    assert re.search(
+        r"names found: 0 in \S+ and 0 in \S+; pair by time or row", err
+    )
 
 
 # Fields of the topics of a log of PX4, as its own definitions of messages have them.
@@ -406,8 +471,12 @@ def of_ulog(*topics):
     flip = np.diag([1.0, -1, -1])
     places = P @ flip
     turns = Rotation.from_matrix(flip @ TRUTH.poses[:, :3, :3] @ flip).as_quat()
-    log = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
-    log += b"".join(message("F", f"{name}:{PX4[name]}".encode()) for name in topics)
+    log = (
+        b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))
+    )
+    log += b"".join(
+        message("F", f"{name}:{PX4[name]}".encode()) for name in topics
+    )
     for number, name in enumerate(topics):
         log += message("A", struct.pack("<BH", 0, number) + name.encode())
     for k, stamp in enumerate((TRUTH.stamps_ns // 1000).tolist()):
@@ -420,7 +489,8 @@ def of_ulog(*topics):
                 "vehicle_attitude": ("4f", turn),
             }[name]
             log += message(
-                "D", struct.pack(f"<HQQ{form}", number, stamp + 900, stamp, *values)
+                "D",
+                struct.pack(f"<HQQ{form}", number, stamp + 900, stamp, *values),
             )
     return log
 
@@ -429,7 +499,9 @@ def of_ulog(*topics):
 def test_a_log_of_px4(tmp_path, topics):
     """Odometry before positions and attitudes; without pyulog one sentence."""
     (tmp_path / "log.ulg").write_bytes(of_ulog(*topics))
-    message = r"'\.\[px4\]'|not contain vehicle_odometry or vehicle_local_position$"
+    message = (
+        r"'\.\[px4\]'|not contain vehicle_odometry or vehicle_local_position$"
+    )
     if not importlib.util.find_spec("pyulog") or topics == ["vehicle_attitude"]:
         with pytest.raises((MissingDependencyError, InputError), match=message):
             read_trajectory_file(tmp_path / "log.ulg", AUTO)
@@ -453,14 +525,29 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"<gpx><trkpt", "no element found|not well-formed|unclosed token"),
         (b'{"type": "FeatureCollection"}', "transforms.json of nerfstudio"),
         (b"[1, 2]", "ego_pose.json of nuScenes"),
-        (b"2023-11-14T22:13:20Z" + b" 1e999" * 15, "expected 8 numbers, .* found 16"),
-        (b"1e999" + b",1" * 15 + b"\n", "so their order is unknown; name the 16"),
+        (
+            b"2023-11-14T22:13:20Z" + b" 1e999" * 15,
+            "expected 8 numbers, .* found 16",
+        ),
+        (
+            b"1e999" + b",1" * 15 + b"\n",
+            "so their order is unknown; name the 16",
+        ),
         (b"EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 1\n", "a g2o graph without vertices"),
-        (b"t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,1e200\n", "line 2: found angle 1e.200"),
-        (b"source_timestamp,destination_timestamp,x,y,z,yaw\n1,2,0,0,0,0\n", "chain"),
+        (
+            b"t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,1e200\n",
+            "line 2: found angle 1e.200",
+        ),
+        (
+            b"source_timestamp,destination_timestamp,x,y,z,yaw\n1,2,0,0,0,0\n",
+            "chain",
+        ),
         (b'<?xml version="1.0"?>\n<kml></kml>', "export the track as GPX"),
         (b"FMT, 128, 89, FMT, BBnNZ, Type\n", "a log of ArduPilot; export"),
-        (b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n", "neither INSPVA"),
+        (
+            b"#BESTPOSA,COM1,0,9.5,FINE,1,2,0,0,0;SOL_COMPUTED,1,2*1\n",
+            "neither INSPVA",
+        ),
         (b"header {\n  stamp {\n", "messages as text; record"),
         (
             b"3.04           OBSERVATION DATA    RINEX VERSION / TYPE\n",
@@ -483,9 +570,15 @@ def test_a_log_of_px4(tmp_path, topics):
             b"# .PCD v0.7\nFIELDS x y z\nSIZE 4\nDATA ascii\n1 2 3\n",
             "points, no trajectory",
         ),
-        (b"header:\n  stamp:\n    sec: 1\n", "YAML without a trajectory; record"),
+        (
+            b"header:\n  stamp:\n    sec: 1\n",
+            "YAML without a trajectory; record",
+        ),
         (of_echo("a,b,c").encode(), "--csv without poses"),
-        (b"$GPRMC,123519,A,,,,,,,230394,,*6A\n", "expected GGA sentences with a fix"),
+        (
+            b"$GPRMC,123519,A,,,,,,,230394,,*6A\n",
+            "expected GGA sentences with a fix",
+        ),
         (
             re.sub(r"\*..", "", of_nmea()).replace("RMC", "ZDA").encode(),
             "the date in RMC",
@@ -494,7 +587,10 @@ def test_a_log_of_px4(tmp_path, topics):
             b"%  GPST  latitude(d'\") longitude(d'\")\n1 2 3\n",
             "set out-solformat to llh, degrees",
         ),
-        (of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(), "rotation type Quaternion"),
+        (
+            of_motive().replace("X,Y,Z,W", "X,Y,Z,").encode(),
+            "rotation type Quaternion",
+        ),
         (
             b"Trajectories\n100\n,,a:b\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n",
             "not markers",
@@ -503,7 +599,9 @@ def test_a_log_of_px4(tmp_path, topics):
         (b"Format Version,1\nTime (Seconds)\n", "Motive|list index"),
     ],
 )
-def test_what_cannot_be_read_is_told_in_one_sentence(tmp_path, content, message):
+def test_what_cannot_be_read_is_told_in_one_sentence(
+    tmp_path, content, message
+):
     path = tmp_path / "file"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message) as error:
@@ -518,11 +616,15 @@ def test_poses_of_an_ins_turn_with_the_heading(tmp_path, is_short):
     trajectory = read_trajectory_file(tmp_path / "log", AUTO).trajectory
     assert_allclose(trajectory.stamps_ns, STAMPS, atol=1_000_000)
     assert_allclose(trajectory.poses[:, :3, 3], P - P[0], atol=1e-4)
-    assert_allclose(trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4)
+    assert_allclose(
+        trajectory.poses[:, :3, :3], TRUTH.poses[:, :3, :3], atol=1e-4
+    )
 
 
 def test_of_several_bodies_one_is_named(tmp_path):
-    (tmp_path / "vicon.csv").write_text(of_vicon(bodies=("drone:drone", "cart:cart")))
+    (tmp_path / "vicon.csv").write_text(
+        of_vicon(bodies=("drone:drone", "cart:cart"))
+    )
     with pytest.raises(
         InputError, match="several segments: drone:drone, cart:cart; name one"
     ):

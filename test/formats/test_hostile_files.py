@@ -20,9 +20,13 @@ from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.formats.yaml_files import read_yaml
 from hand_eye_calib.offline import calibrate as offline
 
-PARENT = motions.as_trajectory(motions.wandering_poses(30), sensor_frame="lidar")
+PARENT = motions.as_trajectory(
+    motions.wandering_poses(30), sensor_frame="lidar"
+)
 CHILD = motions.as_trajectory(
-    motions.disturbed(motions.child_of(motions.wandering_poses(30)), 1, 1e-3, 1e-3),
+    motions.disturbed(
+        motions.child_of(motions.wandering_poses(30)), 1, 1e-3, 1e-3
+    ),
     sensor_frame="camera",
 )
 
@@ -40,7 +44,10 @@ HOSTILE_YAML = {
         "aliases are not supported: write the value of 'a'",
     ),
     "deep flow": ("[" * 100_000, "nest"),
-    "deep blocks": ("\n".join(" " * k + "a:" for k in range(500)), "nested more than"),
+    "deep blocks": (
+        "\n".join(" " * k + "a:" for k in range(500)),
+        "nested more than",
+    ),
     "long integer": ("n: " + "9" * 5000, "is not readable YAML"),
     "float": ("n: !!float abc", "is not readable YAML"),
     "empty integer": ("n: !!int ''", "is not readable YAML"),
@@ -211,13 +218,19 @@ def test_a_csv_cell_of_any_length_is_one_line(tmp_path):
         ("csv", "{t},{x},0,0,0,0,0,1"),
     ],
 )
-@pytest.mark.parametrize("value", ["1e154", "-1e200", "1.7e308", "1e11", "0x10"])
+@pytest.mark.parametrize(
+    "value", ["1e154", "-1e200", "1.7e308", "1e11", "0x10"]
+)
 def test_a_pose_out_of_this_world_is_named(tmp_path, format, row, value):
     lines = ["t,x,y,z,qx,qy,qz,qw"] if format == "csv" else []
-    of_one = {True: "1", False: "0.7071067811865476"}["{x}" in row or format == "kitti"]
+    of_one = {True: "1", False: "0.7071067811865476"}[
+        "{x}" in row or format == "kitti"
+    ]
     for t in range(1, 9):
         lines.append(
-            row.format(t=t, x=value if t == 3 else t, w=value if t == 3 else of_one)
+            row.format(
+                t=t, x=value if t == 3 else t, w=value if t == 3 else of_one
+            )
         )
     path = tmp_path / "parent"
     times = tmp_path / "times"
@@ -256,7 +269,10 @@ def test_links_are_replaced_and_not_followed(calibrate, tmp_path, no_figures):
         assert (tmp_path / f"mine_{name}").read_text() == "mine"
         assert not (tmp_path / "out" / name).is_symlink()
         assert (tmp_path / "out" / name).read_text() != "mine"
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "previous"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *names,
+        "previous",
+    }
 
 
 def test_files_of_somebody_else_are_kept_however_often_results_are_written(
@@ -273,7 +289,9 @@ def test_files_of_somebody_else_are_kept_however_often_results_are_written(
     for _ in range(3):
         assert calibrate() == 0
     contents = [
-        path.read_text() for path in (tmp_path / "out").rglob("*") if path.is_file()
+        path.read_text()
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file()
     ]
     for name in names:
         assert contents.count(f"my own {name}") == 1
@@ -281,7 +299,9 @@ def test_files_of_somebody_else_are_kept_however_often_results_are_written(
     assert len(contents) == 3 * len(names)
 
 
-def test_a_result_that_is_saved_from_python_keeps_files_of_somebody_else(tmp_path):
+def test_a_result_that_is_saved_from_python_keeps_files_of_somebody_else(
+    tmp_path,
+):
     (tmp_path / "static_transform.launch.py").write_text("my launch file")
     for _ in range(2):
         save_result(calibration(), tmp_path)
@@ -306,8 +326,12 @@ def test_a_result_that_is_saved_from_python_keeps_files_of_somebody_else(tmp_pat
     ],
 )
 def test_saved_files_are_well_formed_for_any_name_of_a_frame(tmp_path, frame):
-    save_result(calibration(parent_frame=frame, child_frame=frame + "x"), tmp_path)
-    root = xml.dom.minidom.parse(str(tmp_path / "extrinsic.urdf.xacro")).documentElement
+    save_result(
+        calibration(parent_frame=frame, child_frame=frame + "x"), tmp_path
+    )
+    root = xml.dom.minidom.parse(
+        str(tmp_path / "extrinsic.urdf.xacro")
+    ).documentElement
     assert root.tagName == "robot"
     text = (tmp_path / "static_transform.launch.py").read_text()
     compile(text, "static_transform.launch.py", "exec")

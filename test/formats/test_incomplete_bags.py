@@ -39,7 +39,8 @@ def killed_recording(folder, journal_mode, kept_in_file):
         marks = ", ".join("?" * len(row))
         if journal_mode == "DELETE":
             database.execute(
-                "UPDATE messages SET data = zeroblob(60000) WHERE id = ?", row[:1]
+                "UPDATE messages SET data = zeroblob(60000) WHERE id = ?",
+                row[:1],
             )
         else:
             database.execute(f"INSERT INTO messages VALUES ({marks})", row)
@@ -69,7 +70,10 @@ def test_messages_in_the_wal_of_a_killed_recorder_are_read(
     tmp_path, kept_in_file, as_file
 ):
     killed = killed_recording(tmp_path, "WAL", kept_in_file)
-    assert [path.name[-4:] for path in sorted(killed.iterdir())] == [".db3", "-wal"]
+    assert [path.name[-4:] for path in sorted(killed.iterdir())] == [
+        ".db3",
+        "-wal",
+    ]
     before = state_of(killed)
     with PoseBag(storage_file(killed) if as_file else killed) as bag:
         counts = {topic.name: topic.count for topic in bag.topics.values()}
@@ -94,7 +98,9 @@ def test_a_folder_that_cannot_be_written_is_read_with_its_wal(tmp_path):
 
 def test_an_unfinished_transaction_is_undone_in_a_copy(tmp_path):
     killed = killed_recording(tmp_path, "DELETE", 240)
-    assert [path.name[-8:] for path in sorted(killed.iterdir())][1:] == ["-journal"]
+    assert [path.name[-8:] for path in sorted(killed.iterdir())][1:] == [
+        "-journal"
+    ]
     before = state_of(killed)
     with PoseBag(killed) as bag:
         n_poses = len(bag.poses("/a", "/b"))
@@ -136,7 +142,9 @@ def split_bag(folder, storage, with_counts, prefix=""):
     file = storage_file(folder / "split")
     missing = f"split_1{file.suffix}"
     names = [f"{prefix}{file.name}", f"{prefix}{missing}"]
-    text = METADATA.format(version=9 if with_counts else 4, names=", ".join(names))
+    text = METADATA.format(
+        version=9 if with_counts else 4, names=", ".join(names)
+    )
     if with_counts:
         text += COUNTED.format(*names, 120)
     (folder / "split" / "metadata.yaml").write_text(text)
@@ -169,12 +177,15 @@ def test_a_bag_of_which_only_the_metadata_was_copied_names_its_files(tmp_path):
     path, _ = split_bag(tmp_path, "mcap", with_counts=True)
     storage_file(path).unlink()
     with pytest.raises(
-        InputError, match=r"lists split\.mcap and split_1\.mcap, and no such file"
+        InputError,
+        match=r"lists split\.mcap and split_1\.mcap, and no such file",
     ):
         PoseBag(path)
 
 
-@pytest.mark.parametrize("text", ["", "a: [", "rosbag2_bagfile_information: 3", "x: 1"])
+@pytest.mark.parametrize(
+    "text", ["", "a: [", "rosbag2_bagfile_information: 3", "x: 1"]
+)
 def test_metadata_that_cannot_be_read_changes_nothing(tmp_path, text):
     path, _ = split_bag(tmp_path, "mcap", with_counts=True)
     (path / "metadata.yaml").write_text(text)

@@ -11,7 +11,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator, Calibrators
+from hand_eye_calib.core.engine.calibrator import (
+    BufferLimits,
+    Calibrator,
+    Calibrators,
+)
 from hand_eye_calib.formats.journal import (
     JournalWriter,
     count_poses,
@@ -30,7 +34,9 @@ def messages(n_poses=60):
     poses = wandering_poses(n_poses)
     parent = as_trajectory(poses)
     child = as_trajectory(child_of(poses))
-    both = zip(messages_of("parent", parent), messages_of("child", child), strict=True)
+    both = zip(
+        messages_of("parent", parent), messages_of("child", child), strict=True
+    )
     return list(itertools.chain.from_iterable(both))
 
 
@@ -77,7 +83,9 @@ def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
     calibrator = Calibrator(CONFIG)
     record(writer, calibrator, messages())
     writer.close()
-    parent, child = (hec.read_trajectory(tmp_path / f"{stream}.tum") for stream in BOTH)
+    parent, child = (
+        hec.read_trajectory(tmp_path / f"{stream}.tum") for stream in BOTH
+    )
     result = hec.calibrate(parent, child, method="dnl", reference="B3")
     expected = calibrator.snapshot().streams
     assert_array_equal(parent.stamps_ns, expected[0].stamps_ns)
@@ -88,7 +96,9 @@ def test_its_files_are_trajectories_that_every_program_reads(tmp_path):
     assert np.loadtxt(lines).shape == (60, 8)
 
 
-def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(tmp_path):
+def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(
+    tmp_path,
+):
     writer = JournalWriter(tmp_path, BOTH)
     pose = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     for batch in range(3):
@@ -98,7 +108,14 @@ def test_poses_are_read_in_the_order_in_which_they_came_whatever_their_clocks(tm
     writer.close()
     journal = read_journal(tmp_path)
     assert journal.streams.tolist() == ["parent", "child"] * 3
-    assert journal.stamps_ns.tolist() == [0, 10**12, 1, 10**12 + 1, 2, 10**12 + 2]
+    assert journal.stamps_ns.tolist() == [
+        0,
+        10**12,
+        1,
+        10**12 + 1,
+        2,
+        10**12 + 2,
+    ]
 
 
 def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
@@ -115,13 +132,17 @@ def test_a_session_goes_on_after_the_last_whole_line(tmp_path):
     record(writer, calibrator, sequence[60:])
     writer.close()
     again, journal = resumed(tmp_path)
-    assert journal.whole_bytes["child"] == (tmp_path / "child.tum").stat().st_size
+    assert (
+        journal.whole_bytes["child"] == (tmp_path / "child.tum").stat().st_size
+    )
     assert np.array_equal(
         again.estimate().T_parent_child, calibrator.estimate().T_parent_child
     )
 
 
-def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_path):
+def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(
+    tmp_path,
+):
     writer = JournalWriter(tmp_path, BOTH)
     record(writer, Calibrator(CONFIG), messages(4))
     writer.close()
@@ -134,7 +155,9 @@ def test_whatever_byte_the_file_ends_at_the_whole_lines_before_it_are_read(tmp_p
         whole = max(offset for offset in ends if offset <= end)
         assert journal.whole_bytes["child"] == whole
         expected = [
-            line for line in data[:whole].splitlines() if not line.startswith(b"#")
+            line
+            for line in data[:whole].splitlines()
+            if not line.startswith(b"#")
         ]
         assert (journal.streams == "child").sum() == len(expected)
 
@@ -244,6 +267,8 @@ def test_what_is_no_journal_is_kept_when_journals_are_moved_aside(tmp_path):
     mine.write_text("mine")
     for _ in range(2):
         JournalWriter(tmp_path / "journal", BOTH).close()
-        assert keep_aside(tmp_path / "journal") == tmp_path / "journal.previous2"
+        assert (
+            keep_aside(tmp_path / "journal") == tmp_path / "journal.previous2"
+        )
     assert mine.read_text() == "mine"
     assert count_poses(tmp_path / "journal.previous2") == 0

@@ -42,7 +42,9 @@ def test_arrays_of_zeros_are_refused_by_their_unpacked_size(tmp_path):
     path = tmp_path / "stops.npz"
     np.savez_compressed(path, robot=np.zeros((80_000, 16, 8)))
     assert path.stat().st_size < 200_000
-    with pytest.raises(InputError, match="its arrays take more than 67108864 bytes"):
+    with pytest.raises(
+        InputError, match="its arrays take more than 67108864 bytes"
+    ):
         read_arrays(path)
 
 
@@ -56,7 +58,9 @@ def array_file(header):
     [
         (b"no array", "magic string"),
         (
-            array_file("{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"),
+            array_file(
+                "{'descr': '<f8', 'fortran_order': False, 'shape': (10**12,)}"
+            ),
             "ormed",
         ),
         (
@@ -66,7 +70,9 @@ def array_file(header):
             "truncated",
         ),
         (
-            array_file("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"),
+            array_file(
+                "{'descr': '|O', 'fortran_order': False, 'shape': (1,)}"
+            ),
             "truncated|pickle",
         ),
         (b"\x93NUMPY\x09\x00", "version"),
@@ -101,7 +107,11 @@ def png(width, height):
         rows.write(packer.compress(bytes(width + 1)))
     rows.write(packer.flush())
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    parts = (chunk(b"IHDR", head), chunk(b"IDAT", rows.getvalue()), chunk(b"IEND", b""))
+    parts = (
+        chunk(b"IHDR", head),
+        chunk(b"IDAT", rows.getvalue()),
+        chunk(b"IEND", b""),
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
@@ -131,7 +141,9 @@ def test_a_pipe_among_images_is_refused_and_not_waited_for(tmp_path):
             read_image(path)
 
 
-def test_images_are_in_the_order_of_their_numbers_whatever_digits_they_have(tmp_path):
+def test_images_are_in_the_order_of_their_numbers_whatever_digits_they_have(
+    tmp_path,
+):
     names = ["10.png", "9.png", "a2.png", "²1.png", "٣.png", "a10.png"]
     for name in names:
         (tmp_path / name).touch()
@@ -141,16 +153,17 @@ def test_images_are_in_the_order_of_their_numbers_whatever_digits_they_have(tmp_
     assert ordered.index("a2.png") < ordered.index("a10.png")
 
 
-def test_compressed_points_are_refused_with_the_command_that_unpacks_them(tmp_path):
+def test_compressed_points_are_refused_with_the_command_that_unpacks_them(
+    tmp_path,
+):
     path = tmp_path / "transformations.pcd"
     names = "x y z intensity roll pitch yaw time"
     head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS {names}\nSIZE 4 4 4 4 4 4 4 8\nTYPE F F F F F F F F\n"
-    head += (
-        "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
-    )
+    head += "COUNT 1 1 1 1 1 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary_compressed\n"
     path.write_bytes(head.encode() + bytes(range(80)))
     with pytest.raises(
-        InputError, match="compressed; unpack them: pcl_convert_pcd_ascii_binary"
+        InputError,
+        match="compressed; unpack them: pcl_convert_pcd_ascii_binary",
     ):
         read_trajectory(path)
 

@@ -22,7 +22,9 @@ ENCODINGS = ("cdr", "ros1")
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 TF_DEFINITION = b"geometry_msgs/TransformStamped[] transforms"
 
-names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9)
+names = st.text(
+    st.characters(codec="utf-8", exclude_characters="\0"), max_size=9
+)
 stamps_ns = st.integers(0, 2**31 * 10**9 - 1)
 numbers = st.lists(st.floats(width=64), min_size=7, max_size=7)
 poses = st.tuples(stamps_ns, names, names, numbers)
@@ -65,13 +67,17 @@ def serialized(encoding, message_type, make):
 
 def encoded(encoding, message_type, pose):
     return serialized(
-        encoding, message_type, lambda types: message_of(types, message_type, *pose)
+        encoding,
+        message_type,
+        lambda types: message_of(types, message_type, *pose),
     )
 
 
 def assert_unpacked(columns, drawn, message_type):
     has_frame = MESSAGE_TYPES[message_type].has_child_frame
-    assert columns.stamps_ns.tolist() == [stamp_ns for stamp_ns, _, _, _ in drawn]
+    assert columns.stamps_ns.tolist() == [
+        stamp_ns for stamp_ns, _, _, _ in drawn
+    ]
     worlds = [printable(world.lstrip("/")) for _, world, _, _ in drawn]
     assert columns.world_frames.tolist() == worlds
     sensors = [
@@ -84,7 +90,10 @@ def assert_unpacked(columns, drawn, message_type):
 
 # Of few frames, so that many messages are alike.
 alike = st.tuples(
-    stamps_ns, st.sampled_from(["a", "bc", "de"]), st.sampled_from("st"), numbers
+    stamps_ns,
+    st.sampled_from(["a", "bc", "de"]),
+    st.sampled_from("st"),
+    numbers,
 )
 
 
@@ -102,14 +111,19 @@ def test_poses_at_once_whether_their_frames_are_alike_or_not(
     messages = [encoded(encoding, message_type, pose)[0] for pose in drawn]
     if encoding == "ros1":  # its sequence numbers differ
         messages = [
-            k.to_bytes(4, "little") + data[4:] for k, data in enumerate(messages)
+            k.to_bytes(4, "little") + data[4:]
+            for k, data in enumerate(messages)
         ]
     assert_unpacked(
-        unpack_poses(messages, message_type, encoding == "ros1"), drawn, message_type
+        unpack_poses(messages, message_type, encoding == "ros1"),
+        drawn,
+        message_type,
     )
     if encoding == "cdr":  # one by one, as the node does
         read = MessageReader(message_type, "poses")
-        stamps, worlds, sensors, *values = zip(*map(read, messages), strict=True)
+        stamps, worlds, sensors, *values = zip(
+            *map(read, messages), strict=True
+        )
         table = PoseTable.of(stamps, np.hstack(values), worlds, sensors)
         assert_unpacked(table, drawn, message_type)
 

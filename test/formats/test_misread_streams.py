@@ -93,7 +93,9 @@ def from_the_centre(stream):
 
 def mirrored_about_the_vertical(stream):
     return with_poses(
-        stream, stream.poses[:, :3, :3], stream.poses[:, :3, 3] * [-1.0, -1.0, 1.0]
+        stream,
+        stream.poses[:, :3, :3],
+        stream.poses[:, :3, 3] * [-1.0, -1.0, 1.0],
     )
 
 
@@ -102,7 +104,10 @@ MISREAD = {
     "backward motions": (of_backward_motions, "motions"),
     "order of angles": (in_turning_axes, "euler_order"),
     "turned positions": (turned, "positions_turned"),
-    "positions from the centre of the earth": (from_the_centre, "earth_centred"),
+    "positions from the centre of the earth": (
+        from_the_centre,
+        "earth_centred",
+    ),
     "-x -y": (mirrored_about_the_vertical, "axes"),
 }
 
@@ -139,7 +144,9 @@ def test_right_streams_are_not_named(path, seed):
 def test_streams_of_two_bodies_stay_unrelated():
     parent, _ = pair("hand", 1)
     _, child = noisy_pair(smooth_poses(np.arange(700) / 10), 2, 0.003, 0.0005)
-    assert {code for code, _ in errors(check_streams(parent, child))} == {"unrelated"}
+    assert {code for code, _ in errors(check_streams(parent, child))} == {
+        "unrelated"
+    }
 
 
 # ---- files that the motion of the sensor tells
@@ -170,26 +177,34 @@ def test_rotations_before_translations_are_read_by_rows_or_by_columns(
     assert f"read {order}" in guesses
     expected = rotations if is_by_columns or not by_columns else written
     assert_allclose(trajectory.poses[:, :3, :3], expected, atol=1e-9)
-    assert_allclose(trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9)
+    assert_allclose(
+        trajectory.poses[:, :3, 3], truth.poses[:, :3, 3], atol=1e-9
+    )
 
 
 FRAMES = {
     "axes of the earth": (lambda axes: axes, "the axes of the earth, too"),
     "east, north, up": (lambda axes: np.eye(3), "east, north and up"),
     "north, east, down": (
-        lambda axes: np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+        lambda axes: np.array(
+            [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
+        ),
         "north, east and down",
     ),
 }
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_orientations_of_positions_from_the_centre_of_the_earth(tmp_path, frame):
+def test_orientations_of_positions_from_the_centre_of_the_earth(
+    tmp_path, frame
+):
     to_file, words = FRAMES[frame]
     axes = axes_of_places(HANNOVER_M[None])[0]
     truth = as_trajectory(hilly_drive())
     positions = truth.poses[:, :3, 3] @ axes.T + HANNOVER_M
-    spoiled = with_poses(truth, to_file(axes) @ truth.poses[:, :3, :3], positions)
+    spoiled = with_poses(
+        truth, to_file(axes) @ truth.poses[:, :3, :3], positions
+    )
     write_trajectory(tmp_path / "ecef.tum", spoiled)
     trajectory, guesses = read(tmp_path / "ecef.tum")
     assert words in guesses

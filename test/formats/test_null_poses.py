@@ -58,7 +58,9 @@ def spoiled(rows, null, indices):
 def bag_of(path, storage, kind, rows):
     """A bag with the parent as odometry on /a, and the child, whose rows are given, on /b or TF."""
     recorded = []
-    for stamp_ns, parent, child in zip(STAMPS_NS.tolist(), PARENT, rows, strict=True):
+    for stamp_ns, parent, child in zip(
+        STAMPS_NS.tolist(), PARENT, rows, strict=True
+    ):
         make = pose_message(ODOMETRY, stamp_ns, parent, "map", "lidar")
         recorded.append((stamp_ns, "/a", ODOMETRY, make))
         if kind == TF:
@@ -95,7 +97,9 @@ def read(path, child):
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("kind", [ODOMETRY, POSE_STAMPED, TF])
 @pytest.mark.parametrize("null", NULLS.values(), ids=[*NULLS])
-def test_null_poses_of_a_bag_are_left_out_and_counted(tmp_path, storage, kind, null):
+def test_null_poses_of_a_bag_are_left_out_and_counted(
+    tmp_path, storage, kind, null
+):
     rows = spoiled(CHILD, null, FEW)
     path = bag_of(bag_path(tmp_path, storage), storage, kind, rows)
     source = "odom:camera" if kind == TF else "/b"
@@ -112,18 +116,26 @@ def test_null_poses_of_a_bag_are_left_out_and_counted(tmp_path, storage, kind, n
 
 def test_many_null_poses_ask_for_another_recording(tmp_path):
     path = bag_of(
-        tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, NULLS["all zero"], MANY)
+        tmp_path / "bag",
+        "mcap",
+        ODOMETRY,
+        spoiled(CHILD, NULLS["all zero"], MANY),
     )
     _, _, (warning,) = read(path, "/b")
     assert warning.startswith("/b: 40 of 200 poses (20%) were left out: ")
-    assert warning.endswith("check whether the source loses track, and record again")
+    assert warning.endswith(
+        "check whether the source loses track, and record again"
+    )
 
 
 def test_the_result_with_null_poses_is_the_truth_and_says_their_number(
     tmp_path, capsys
 ):
     path = bag_of(
-        tmp_path / "bag", "sqlite3", POSE_STAMPED, spoiled(CHILD, NULLS["a NaN"], FEW)
+        tmp_path / "bag",
+        "sqlite3",
+        POSE_STAMPED,
+        spoiled(CHILD, NULLS["a NaN"], FEW),
     )
     options = [
         "--parent-topic",
@@ -136,16 +148,34 @@ def test_the_result_with_null_poses_is_the_truth_and_says_their_number(
     ]
     main(["calibrate", str(path), *options])
     document = json.loads(capsys.readouterr().out)
-    assert [text for text in document["warnings"] if "6 of 200 poses (3.0%)" in text]
-    assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6)
+    assert [
+        text for text in document["warnings"] if "6 of 200 poses (3.0%)" in text
+    ]
+    assert_allclose(
+        document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-6
+    )
 
 
-def test_a_quaternion_that_is_neither_unit_nor_zero_is_still_refused(tmp_path, capsys):
+def test_a_quaternion_that_is_neither_unit_nor_zero_is_still_refused(
+    tmp_path, capsys
+):
     path = bag_of(
-        tmp_path / "bag", "mcap", ODOMETRY, spoiled(CHILD, [0, 0, 0, 0, 0, 0, 0.5], FEW)
+        tmp_path / "bag",
+        "mcap",
+        ODOMETRY,
+        spoiled(CHILD, [0, 0, 0, 0, 0, 0, 0.5], FEW),
     )
     assert (
-        main(["calibrate", str(path), "--parent-topic", "/a", "--child-topic", "/b"])
+        main(
+            [
+                "calibrate",
+                str(path),
+                "--parent-topic",
+                "/a",
+                "--child-topic",
+                "/b",
+            ]
+        )
         == 1
     )
     assert "quaternion of length 0.5, expected 1" in capsys.readouterr().err
@@ -159,7 +189,9 @@ def test_null_poses_of_a_path_are_left_out(tmp_path):
             orientation.x = orientation.y = orientation.z = orientation.w = 0.0
         return message
 
-    path = write_messages(tmp_path / "bag", [(int(STAMPS_NS[-1]), "/path", PATH, make)])
+    path = write_messages(
+        tmp_path / "bag", [(int(STAMPS_NS[-1]), "/path", PATH, make)]
+    )
     with PoseBag(path) as bag:
         trajectory, _ = bag.trajectory("/path")
         warnings = bag.warnings
@@ -171,7 +203,10 @@ def test_null_poses_of_a_path_are_left_out(tmp_path):
 
 def test_null_poses_of_fields_are_left_out(tmp_path):
     path = bag_of(
-        tmp_path / "bag", "mcap", POSE_STAMPED, spoiled(CHILD, NULLS["all zero"], FEW)
+        tmp_path / "bag",
+        "mcap",
+        POSE_STAMPED,
+        spoiled(CHILD, NULLS["all zero"], FEW),
     )
     place = ",".join(f"{axis}=pose.position.{axis}" for axis in "xyz")
     turn = ",".join(f"q{axis}=pose.orientation.{axis}" for axis in "xyzw")
@@ -212,33 +247,45 @@ def live_input():
     lines = Lines()
     log = NodeLog(lines)
     session = LiveSession(log, CalibratorConfig())
-    return PoseInput("child", "/b", session, log, lambda _: None), session, lines
+    return (
+        PoseInput("child", "/b", session, log, lambda _: None),
+        session,
+        lines,
+    )
 
 
 @pytest.mark.parametrize("null", NULLS.values(), ids=[*NULLS])
-@pytest.mark.parametrize(("indices", "level"), [(FEW, Level.OK), (MANY, Level.WARN)])
-def test_null_poses_of_a_live_input_are_counted_and_are_no_error(null, indices, level):
+@pytest.mark.parametrize(
+    ("indices", "level"), [(FEW, Level.OK), (MANY, Level.WARN)]
+)
+def test_null_poses_of_a_live_input_are_counted_and_are_no_error(
+    null, indices, level
+):
     pose_input, session, lines = live_input()
     for stamp_ns, row in zip(
         STAMPS_NS.tolist(), spoiled(CHILD, null, indices), strict=True
     ):
         frame = "camera" if row[3:].any() else ""
-        fields = PoseFields(stamp_ns, "odom", frame, row[:3].tolist(), row[3:].tolist())
+        fields = PoseFields(
+            stamp_ns, "odom", frame, row[:3].tolist(), row[3:].tolist()
+        )
         pose_input.accept(stamp_ns, lambda fields=fields: fields)
     state = pose_input.state(pose_input._arrived_s, may_rest=False)
     assert state.level is level
     assert state.refused["no pose"] == len(indices)
     assert state.poses_taken == N - len(indices)
-    assert ("20% of the messages have no pose" in state.text) == (level is Level.WARN)
+    assert ("20% of the messages have no pose" in state.text) == (
+        level is Level.WARN
+    )
     assert session.calibrator.frame("child") == "camera"
     assert [text for kind, text in lines.written if "is refused" in text] == []
 
 
 def test_a_null_message_is_read_live_as_in_a_bag():
     reader = MessageReader(ODOMETRY, "poses")
-    message = pose_message(ODOMETRY, STAMPS_NS[0], NULLS["all zero"], "odom", "camera")(
-        JAZZY
-    )
+    message = pose_message(
+        ODOMETRY, STAMPS_NS[0], NULLS["all zero"], "odom", "camera"
+    )(JAZZY)
     fields = reader(bytes(JAZZY.serialize_cdr(message, ODOMETRY)))
     assert fields.quat_xyzw == (0.0, 0.0, 0.0, 0.0)
     assert header(JAZZY, STAMPS_NS[0], "odom").frame_id == fields.world_frame
@@ -255,7 +302,9 @@ def test_a_live_stream_with_whole_seconds_says_so():
     state = pose_input.state(pose_input._arrived_s, may_rest=False)
     later = pose_input.state(pose_input._arrived_s + 11.0, may_rest=True)
     assert state.level is Level.ERROR
-    assert "/b: the stamps have whole seconds only: set header.stamp" in state.text
+    assert (
+        "/b: the stamps have whole seconds only: set header.stamp" in state.text
+    )
     assert state.poses_taken == 10
     assert later.level is Level.WARN
     assert "the stamps have whole seconds only" in later.text

@@ -73,10 +73,14 @@ def messages():
     """Topic and type to the messages of all stamps."""
     lat, lon, height = GEODETIC
     steps = se3.log(se3.inverse(TRUTH.poses[:-1]) @ TRUTH.poses[1:]) / 0.05
-    twists = np.concatenate([steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]])
+    twists = np.concatenate(
+        [steps[:1], (steps[1:] + steps[:-1]) / 2, steps[-1:]]
+    )
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     rpy = np.degrees(se3.rotation_to_rpy(TRUTH.poses[:, :3, :3]))
-    px4 = [*zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)]
+    px4 = [
+        *zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)
+    ]
     types = {
         "/twist": TWIST,
         "/fix": FIX,
@@ -95,13 +99,18 @@ def messages():
         head = header(JAZZY, stamp_ns, "sensor")
         quaternion = made("Quaternion", *Q[k])
         twist = made(
-            "Twist", made("Vector3", *twists[k, :3]), made("Vector3", *twists[k, 3:])
+            "Twist",
+            made("Vector3", *twists[k, :3]),
+            made("Vector3", *twists[k, 3:]),
         )
         pose = made("Pose", made("Point", *P[k]), quaternion)
         point = made(POINT, lat[k], lon[k], height[k])
         fields = {
             TWIST: (head, twist),
-            types["/twists"]: (head, made("TwistWithCovariance", twist, np.zeros(36))),
+            types["/twists"]: (
+                head,
+                made("TwistWithCovariance", twist, np.zeros(36)),
+            ),
             FIX: (head, status, lat[k], lon[k], height[k], nine, 0),
             IMU: (head, quaternion, nine, zero, nine, zero, nine),
             PX4: (0, stamp_ns // 1000, 1, *px4[k], 1, *[nothing] * 5, 0, 0),
@@ -128,14 +137,18 @@ def messages():
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     path = tmp_path_factory.mktemp("bags") / "bag"
-    writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    writer = rosbag2.Writer(
+        path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+    )
     with writer:
         for (topic, type_), all_messages in messages().items():
             connection = writer.add_connection(topic, type_, typestore=JAZZY)
             for stamp_ns, message in zip(
                 TRUTH.stamps_ns.tolist(), all_messages, strict=True
             ):
-                writer.write(connection, stamp_ns, JAZZY.serialize_cdr(message, type_))
+                writer.write(
+                    connection, stamp_ns, JAZZY.serialize_cdr(message, type_)
+                )
     return path
 
 
@@ -174,7 +187,9 @@ def test_the_poses_are_those_of_the_truth(bag, source, within):
     trajectory = read_bag_trajectory(bag, source)
     assert trajectory.measures == "poses"
     assert_allclose(trajectory.stamps_ns, TRUTH.stamps_ns, atol=1000, rtol=0)
-    assert_allclose(from_start(trajectory.poses), from_start(TRUTH.poses), atol=within)
+    assert_allclose(
+        from_start(trajectory.poses), from_start(TRUTH.poses), atol=within
+    )
 
 
 def foxglove(kind, k):
@@ -195,7 +210,9 @@ def foxglove(kind, k):
         "FrameTransforms": {"transforms": [moving]},
         "LocationFix": {"latitude": lat, "longitude": lon, "altitude": height},
     }
-    timed = {} if kind == "FrameTransforms" else {"timestamp": moving["timestamp"]}
+    timed = (
+        {} if kind == "FrameTransforms" else {"timestamp": moving["timestamp"]}
+    )
     return timed | parts[kind]
 
 
@@ -235,7 +252,13 @@ def in_protobuf(path, kind):
 @pytest.mark.parametrize("write", [in_json, in_protobuf])
 @pytest.mark.parametrize(
     "kind",
-    ["PoseInFrame", "PosesInFrame", "FrameTransform", "FrameTransforms", "LocationFix"],
+    [
+        "PoseInFrame",
+        "PosesInFrame",
+        "FrameTransform",
+        "FrameTransforms",
+        "LocationFix",
+    ],
 )
 def test_messages_of_foxglove(tmp_path, kind, write):
     write(tmp_path / "poses.mcap", kind)
@@ -265,7 +288,9 @@ def test_json_without_what_its_type_has_is_named(tmp_path):
 
 def test_values_that_are_not_finite_are_left_out(tmp_path):
     in_json(
-        tmp_path / "poses.mcap", "PoseInFrame", (b'"x": -', b'"x": -Infinity, "X": ')
+        tmp_path / "poses.mcap",
+        "PoseInFrame",
+        (b'"x": -', b'"x": -Infinity, "X": '),
     )
     with PoseBag(tmp_path / "poses.mcap") as opened:
         trajectory, _ = opened.trajectory("/pose")
@@ -279,13 +304,13 @@ def test_values_that_are_not_finite_are_left_out(tmp_path):
 
 
 def test_fields_of_a_place_are_positions(bag):
-    fields = (
-        "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
-    )
+    fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
     for source in (f"/array?{fields}", "/gps"):
         trajectory = read_bag_trajectory(bag, source)
         assert trajectory.measures == "positions"
-        assert_allclose(from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5)
+        assert_allclose(
+            from_start(trajectory.poses)[:, :3, 3], P - P[0], atol=1e-5
+        )
 
 
 @pytest.mark.parametrize(
@@ -315,7 +340,9 @@ def test_fields_of_a_place_are_positions(bag):
         ),
     ],
 )
-def test_what_cannot_be_read_is_told_in_one_sentence(bag, source, error, message):
+def test_what_cannot_be_read_is_told_in_one_sentence(
+    bag, source, error, message
+):
     with pytest.raises(error, match=message) as caught:
         read_bag_trajectory(bag, source)
     assert "\n" not in str(caught.value)
@@ -330,9 +357,7 @@ def test_calibrate_takes_fields_and_two_topics(bag, tmp_path, capsys):
         "--child-topic",
         "/array",
     ]
-    fields = (
-        "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
-    )
+    fields = "t=header.stamp,x=poses.0.position.x,y=poses.0.position.y,z=poses.0.position.z"
     assert main(
         [*command, "--child-fields", fields, "--child-measures", "positions"]
     ) in (0, 1, 3)

@@ -22,8 +22,16 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.plain import json_text, plain
 from hand_eye_calib.core.checks import findings as wording
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
-from hand_eye_calib.core.results.records import AxisScatter, CorrelatedError, Noise
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.core.results.records import (
+    AxisScatter,
+    CorrelatedError,
+    Noise,
+)
 from hand_eye_calib.extras.partial.rate_bias import RateBias
 from hand_eye_calib.formats.results import load_result, save_result, save_rig
 from hand_eye_calib.formats.yaml_files import yaml_text
@@ -53,7 +61,13 @@ def test_a_saved_calibration_loads_bit_by_bit_from_file_and_directory(tmp_path):
 
 
 def test_numbers_of_numpy_anywhere_are_plain_in_yaml_and_json():
-    numbers = (np.float32(0.5), np.int64(3), np.bool_(True), np.str_("word"), None)
+    numbers = (
+        np.float32(0.5),
+        np.int64(3),
+        np.bool_(True),
+        np.str_("word"),
+        None,
+    )
     data = {
         "a": [*numbers, {"b": np.array([1.0, 2.0])}],
         "c": (SolveStatus.OK, Verdict.USE),
@@ -61,7 +75,11 @@ def test_numbers_of_numpy_anywhere_are_plain_in_yaml_and_json():
     values = [0.5, 3, True, "word", None, {"b": [1.0, 2.0]}]
     expected = {"a": values, "c": [SolveStatus.OK.value, Verdict.USE.value]}
     assert plain(data) == expected
-    assert yaml.safe_load(yaml_text(data)) == json.loads(json_text(data)) == expected
+    assert (
+        yaml.safe_load(yaml_text(data))
+        == json.loads(json_text(data))
+        == expected
+    )
 
 
 def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
@@ -70,12 +88,16 @@ def test_a_result_with_findings_and_all_records_comes_back(tmp_path):
         in_words=("words",),
         misfit=1.0,
         lasting=(
-            CorrelatedError(kind="body", part="rotation", sigma=1e-3, tau_s=20.0),
+            CorrelatedError(
+                kind="body", part="rotation", sigma=1e-3, tau_s=20.0
+            ),
         ),
     )
     axis = AxisProgress(sigma=np.inf, target=0.02, seconds_left=9.0)
     written = calibration(
-        findings=(wording.finding("rotation_gain", "child", axis="0, 0, 1", **gain),),
+        findings=(
+            wording.finding("rotation_gain", "child", axis="0, 0, 1", **gain),
+        ),
         noise=noise,
         parts={
             "goal": Progress(sentence="go on", axes={"x": axis}),
@@ -113,7 +135,11 @@ LATE = {"delay_s": 0.12, "sigma_s": 0.01, "shift_m": 0.2}
     "finding",
     [
         wording.finding(
-            "gaps", "parent", gaps=np.int64(3), longest_s=np.float64(2.5), share=0.1
+            "gaps",
+            "parent",
+            gaps=np.int64(3),
+            longest_s=np.float64(2.5),
+            share=0.1,
         ),
         wording.finding(
             "late", code="late", part="positions", others="orientations", **LATE
@@ -138,12 +164,27 @@ def test_a_finding_in_a_file_has_its_values_and_its_sentences(finding):
         {"values": {"gaps": 3}},
         {"values": {"gaps": 3, "longest_s": "long", "share": 0.1}},
     ],
-    ids=["of version 0.2", "unknown key", "missing value", "value of another type"],
+    ids=[
+        "of version 0.2",
+        "unknown key",
+        "missing value",
+        "value of another type",
+    ],
 )
 def test_a_finding_without_words_keeps_the_sentences_of_its_file(changes):
-    finding = wording.finding("gaps", "parent", gaps=3, longest_s=2.5, share=0.1)
+    finding = wording.finding(
+        "gaps", "parent", gaps=3, longest_s=2.5, share=0.1
+    )
     read = written_and_read(finding, **changes)
-    for name in ("code", "stream", "severity", "what", "advice", "cause", "evidence"):
+    for name in (
+        "code",
+        "stream",
+        "severity",
+        "what",
+        "advice",
+        "cause",
+        "evidence",
+    ):
         assert getattr(read, name) == getattr(finding, name)
     assert written_and_read(read) == read
 
@@ -163,7 +204,9 @@ def test_an_axis_that_is_not_known_has_no_number_in_json_and_yaml(tmp_path):
         ]
         assert transform["matrix"] == written.T_parent_child.tolist()
         inverse = document["T_child_parent"]
-        assert inverse["translation"] == inverse["sigma_translation"] == [None] * 3
+        assert (
+            inverse["translation"] == inverse["sigma_translation"] == [None] * 3
+        )
     assert_same(load_result(path), written)
 
 
@@ -185,23 +228,35 @@ def test_a_rotation_that_is_not_known_has_no_quaternion_and_no_number_for_a_robo
     xacro, launch = (
         (tmp_path / name).read_text(encoding="utf-8") for name in ROBOT_FILES
     )
-    assert re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
+    assert (
+        re.search(r'rpy="(.*?)"', xacro)[1].split()[2] == "MEASURE_YAW_BY_HAND"
+    )
     assert "'--yaw', 'MEASURE_YAW_BY_HAND'" in launch
     assert "--qx" not in launch
 
 
-@pytest.mark.parametrize("words", [["info"], ["info", "--json"], ["compare", "--json"]])
-def test_a_file_with_an_unknown_axis_is_read_by_the_commands(tmp_path, capsys, words):
+@pytest.mark.parametrize(
+    "words", [["info"], ["info", "--json"], ["compare", "--json"]]
+)
+def test_a_file_with_an_unknown_axis_is_read_by_the_commands(
+    tmp_path, capsys, words
+):
     for name in ("one", "two"):
-        save_result(calibration(status=SolveStatus.UNOBSERVABLE), tmp_path / name)
+        save_result(
+            calibration(status=SolveStatus.UNOBSERVABLE), tmp_path / name
+        )
     paths = [str(tmp_path / name) for name in ("one", "two")]
-    code = main([words[0], *paths[: 1 if words[0] == "info" else 2], *words[1:]])
+    code = main(
+        [words[0], *paths[: 1 if words[0] == "info" else 2], *words[1:]]
+    )
     output = capsys.readouterr()
     assert (code, output.err) == (0 if words[0] == "info" else 3, "")
     if "--json" not in words:
         assert re.search(r"z +unknown", output.out)
     elif words[0] == "info":
-        assert json.loads(output.out)["T_parent_child"]["translation"][2] is None
+        assert (
+            json.loads(output.out)["T_parent_child"]["translation"][2] is None
+        )
     else:
         (difference,) = json.loads(output.out)["differences"]
         assert difference["axes"]["z"]["verdict"] == "cannot tell"
@@ -212,9 +267,13 @@ def test_the_file_says_where_it_came_from(tmp_path):
     document = yaml.safe_load(
         save_result(calibration(), tmp_path, inputs).read_text(encoding="utf-8")
     )
-    assert (document["format"], document["version"]) == ("hand_eye_calib/extrinsic", 2)
+    assert (document["format"], document["version"]) == (
+        "hand_eye_calib/extrinsic",
+        2,
+    )
     assert (
-        document["T_parent_child"]["maps"] == "coordinates of caméra: links into lidar"
+        document["T_parent_child"]["maps"]
+        == "coordinates of caméra: links into lidar"
     )
     product = (
         np.array(document["T_parent_child"]["matrix"])
@@ -231,7 +290,10 @@ def test_the_file_says_where_it_came_from(tmp_path):
     assert provenance["created"].endswith("+00:00")
 
 
-AWKWARD = {"parent_frame": 'li"dar & <${x}>', "child_frame": "caméra -- 'left' \\ side"}
+AWKWARD = {
+    "parent_frame": 'li"dar & <${x}>',
+    "child_frame": "caméra -- 'left' \\ side",
+}
 
 
 def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
@@ -239,8 +301,15 @@ def test_the_xacro_file_is_a_fixed_joint_with_the_extrinsic(tmp_path):
     save_result(written, tmp_path)
     root = ElementTree.parse(tmp_path / "extrinsic.urdf.xacro").getroot()
     (joint,) = root
-    assert (root.tag, joint.tag, joint.get("type")) == ("robot", "joint", "fixed")
-    assert joint.find("parent").get("link").replace("$$", "$") == written.parent_frame
+    assert (root.tag, joint.tag, joint.get("type")) == (
+        "robot",
+        "joint",
+        "fixed",
+    )
+    assert (
+        joint.find("parent").get("link").replace("$$", "$")
+        == written.parent_frame
+    )
     assert joint.find("child").get("link") == written.child_frame
     xyz, rpy = (
         np.array(joint.find("origin").get(name).split(), dtype=float)
@@ -263,7 +332,9 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     compile(text, "static_transform.launch.py", "exec")
     tree = ast.parse(text)
     calls = {
-        node.func.id: node for node in ast.walk(tree) if isinstance(node, ast.Call)
+        node.func.id: node
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
     }
     assert set(calls) == {"LaunchDescription", "Node"}
     (transforms,) = (
@@ -273,9 +344,13 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     )
     assert f"# {written.headline}\n" in text
     node = {
-        keyword.arg: ast.unparse(keyword.value) for keyword in calls["Node"].keywords
+        keyword.arg: ast.unparse(keyword.value)
+        for keyword in calls["Node"].keywords
     }
-    program = {"package": "'tf2_ros'", "executable": "'static_transform_publisher'"}
+    program = {
+        "package": "'tf2_ros'",
+        "executable": "'static_transform_publisher'",
+    }
     assert node == program | {"arguments": "each"}
     (arguments,) = transforms
     options = dict(zip(arguments[::2], arguments[1::2], strict=True))
@@ -289,7 +364,9 @@ def test_the_launch_file_compiles_and_publishes_the_extrinsic(tmp_path):
     ]
     assert options == {}
     assert_allclose(
-        se3.from_quat_xyzw(values[:3], values[3:]), written.T_parent_child, atol=1e-11
+        se3.from_quat_xyzw(values[:3], values[3:]),
+        written.T_parent_child,
+        atol=1e-11,
     )
     typed = shlex.split(written.static_transform_command())
     assert typed[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
@@ -311,7 +388,10 @@ def test_an_unknown_axis_is_nothing_that_a_robot_takes(tmp_path):
     )
     xyz = re.search(r'xyz="(.*?)"', xacro)[1].split()
     assert xyz[2] == "MEASURE_Z_BY_HAND"
-    assert list(map(float, xyz[:2])) == calibration().T_parent_child[:2, 3].tolist()
+    assert (
+        list(map(float, xyz[:2]))
+        == calibration().T_parent_child[:2, 3].tolist()
+    )
     assert "'--z', 'MEASURE_Z_BY_HAND'" in launch
 
 
@@ -337,7 +417,9 @@ def test_saving_again_replaces_the_file_and_leaves_nothing_else(tmp_path):
 
 
 @pytest.mark.parametrize("save", [hec.save, Calibration.save])
-def test_the_public_save_keeps_an_earlier_result_with_its_report(save, tmp_path):
+def test_the_public_save_keeps_an_earlier_result_with_its_report(
+    save, tmp_path
+):
     earlier = hec.save(good_calibration(), tmp_path).read_bytes()
     report = tmp_path / "report.html"
     report.write_text("report of the first result, by hand_eye_calib")
@@ -396,12 +478,20 @@ def edited(**changes):
             edited(T_parent_child={"matrix": [[1.0, 0.0]]}),
             "was changed after it was written",
         ),
-        (edited(status="splendid"), "was changed after it was written: 'splendid'"),
+        (
+            edited(status="splendid"),
+            "was changed after it was written: 'splendid'",
+        ),
         (edited(warnings=None), "was changed after it was written"),
-        ("a: [1", "is not readable YAML: .*; restore the file, or calibrate again"),
+        (
+            "a: [1",
+            "is not readable YAML: .*; restore the file, or calibrate again",
+        ),
     ],
 )
-def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message):
+def test_what_is_no_calibration_is_refused_with_the_file(
+    tmp_path, text, message
+):
     path = tmp_path / "extrinsic.yaml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=message) as caught:
@@ -413,7 +503,9 @@ def test_what_is_no_calibration_is_refused_with_the_file(tmp_path, text, message
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"cannot read .*absent: No such file"):
         load_result(tmp_path / "absent")
-    with pytest.raises(InputError, match=r"has no extrinsic\.yaml: name the folder"):
+    with pytest.raises(
+        InputError, match=r"has no extrinsic\.yaml: name the folder"
+    ):
         load_result(tmp_path)
     (tmp_path / "extrinsic.yaml").write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(InputError, match="not a text file; expected YAML"):
@@ -477,7 +569,8 @@ def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
             parts = np.hypot(row["sigma_measured"], row["allowance"])
             assert row["sigma"] == pytest.approx(parts, rel=1e-12)
     parts = (
-        document[f"covariance_{name}"]["matrix"] for name in ("measured", "allowance")
+        document[f"covariance_{name}"]["matrix"]
+        for name in ("measured", "allowance")
     )
     finite = np.array(document["covariance"]["matrix"][0], dtype=float)
     assert_allclose(
@@ -487,7 +580,11 @@ def test_every_sigma_of_a_document_has_the_allowance_and_its_parts_beside_it():
 
 def of_version_1(document):
     """A document as version 1 had it: sigma and covariance without the allowance."""
-    old = {**document, "version": 1, "covariance": document["covariance_measured"]}
+    old = {
+        **document,
+        "version": 1,
+        "covariance": document["covariance_measured"],
+    }
     old["floor"] = document["covariance_allowance"]
     old["sigma_total"] = document["sigma"]
     old["observability"] = [
@@ -508,7 +605,9 @@ def of_version_1(document):
 def test_a_document_of_version_1_is_read_with_its_covariance_as_the_measured_part():
     scatter = AxisScatter(sigma=0.003, of_methods=0.004, of_halves=None)
     written = calibration(covariance_allowance=1e-6 * np.eye(6))
-    old = of_version_1(written.to_dict()) | {"cross_check": {"x": plain(scatter)}}
+    old = of_version_1(written.to_dict()) | {
+        "cross_check": {"x": plain(scatter)}
+    }
     read = Calibration.from_dict(old)
     assert_array_equal(read.covariance_measured, written.covariance_measured)
     assert_array_equal(read.covariance, written.covariance)
@@ -522,7 +621,8 @@ def test_a_document_whose_sigma_is_not_that_of_its_parts_is_refused():
     first, *others = document["observability"]
     changed = document | {"observability": [first | {"sigma": 0.5}, *others]}
     with pytest.raises(
-        InputError, match="sigma is not that of sigma_measured and the allowance"
+        InputError,
+        match="sigma is not that of sigma_measured and the allowance",
     ):
         Calibration.from_dict(changed)
 
@@ -538,7 +638,12 @@ def test_a_document_whose_covariance_is_not_the_sum_of_its_parts_is_refused():
 
 def test_a_result_without_a_part_has_its_attributes_empty_and_no_others():
     result = calibration()
-    without = (result.goal, result.together, result.rate_bias, result.T_world_world)
+    without = (
+        result.goal,
+        result.together,
+        result.rate_bias,
+        result.T_world_world,
+    )
     assert without == (None,) * 4
     assert (result.parent_world_frame, result.child_world_frame) == ("", "")
     with pytest.raises(AttributeError, match="no attribute 'T_child_paren'"):

@@ -30,7 +30,8 @@ def moving(parent, child, period_ms, n_poses, start_ms=0):
 
 def in_order(*edges):
     return sorted(
-        (pose for edge in edges for pose in edge), key=lambda pose: pose[0].stamp_ns
+        (pose for edge in edges for pose in edge),
+        key=lambda pose: pose[0].stamp_ns,
     )
 
 
@@ -72,20 +73,28 @@ def test_two_moving_edges_at_the_stamps_of_the_slower():
     )
     odometry = Trajectory(10 * MS * np.arange(300), wandering_poses(300))
     k = (stamps_ns // MS - 3) // 100
-    expected = wandering_poses(30)[k] @ odometry.at(stamps_ns, straight=True) @ MOUNT
-    assert_allclose([pose.position for pose in poses], expected[:, :3, 3], atol=1e-12)
+    expected = (
+        wandering_poses(30)[k] @ odometry.at(stamps_ns, straight=True) @ MOUNT
+    )
+    assert_allclose(
+        [pose.position for pose in poses], expected[:, :3, 3], atol=1e-12
+    )
 
 
 def test_nothing_is_interpolated_across_a_gap():
     odometry = moving("odom", "base", 10, 300)
-    events = in_order(moving("map", "odom", 100, 30), odometry[:100] + odometry[205:])
+    events = in_order(
+        moving("map", "odom", 100, 30), odometry[:100] + odometry[205:]
+    )
     _, poses = live(events, "map:base")
     assert len(poses) > 10
     assert not [pose for pose in poses if 1000 * MS < pose.stamp_ns < 2050 * MS]
 
 
 def test_a_loop_of_a_bag_goes_on_with_new_stamps():
-    events = in_order(moving("map", "odom", 100, 30), moving("odom", "base", 10, 300))
+    events = in_order(
+        moving("map", "odom", 100, 30), moving("odom", "base", 10, 300)
+    )
     _, once = live(events, "map:base")
     _, twice = live(events * 2, "map:base")
     assert twice[: len(once)] == once
@@ -103,7 +112,10 @@ def test_what_is_missing_is_said_with_what_is_there():
 @pytest.mark.parametrize(
     ("event", "text"),
     [
-        ((stamped("other", "lidar", 0, MOUNT), True), "frame 'lidar' has two parents"),
+        (
+            (stamped("other", "lidar", 0, MOUNT), True),
+            "frame 'lidar' has two parents",
+        ),
         (
             (
                 stamped("odom", "base", 0, MOUNT)._replace(
@@ -115,14 +127,18 @@ def test_what_is_missing_is_said_with_what_is_there():
         ),
         (
             (
-                stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, 1e300, 0.0)),
+                stamped("odom", "base", 0, MOUNT)._replace(
+                    position=(0.0, 1e300, 0.0)
+                ),
                 False,
             ),
             "transform odom:base: ",
         ),
         (
             (
-                stamped("odom", "base", 0, MOUNT)._replace(position=(0.0, np.nan, 0.0)),
+                stamped("odom", "base", 0, MOUNT)._replace(
+                    position=(0.0, np.nan, 0.0)
+                ),
                 False,
             ),
             "transform odom:base: .* a value that is not finite",

@@ -6,7 +6,13 @@ import json
 
 import numpy as np
 import pytest
-from motions import T_PARENT_CHILD, as_trajectory, child_of, disturbed, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    disturbed,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose, assert_array_equal
 
 import hand_eye_calib as hec
@@ -22,7 +28,9 @@ START_NS = 1_700_000_000_123_456_789
 TRAJECTORY = as_trajectory(wandering_poses(30), start_ns=START_NS)
 POSITIONS = TRAJECTORY.poses[:, :3, 3].tolist()
 QUATS_XYZW = se3.to_quat_xyzw(TRAJECTORY.poses).tolist()
-NO_QUATERNION = "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for rotations"
+NO_QUATERNION = (
+    "no column for qx, .* or rotvec_x,rotvec_y,rotvec_z for rotations"
+)
 XYZW = "t,x,y,z,qx,qy,qz,qw"
 WXYZ = "t,x,y,z,qw,qx,qy,qz"
 
@@ -41,7 +49,9 @@ def file(tmp_path):
 
 def rows(stamps, order="xyzw", separator=","):
     """Lines of stamp, position, quaternion."""
-    quats = [[quat["xyzw".index(axis)] for axis in order] for quat in QUATS_XYZW]
+    quats = [
+        [quat["xyzw".index(axis)] for axis in order] for quat in QUATS_XYZW
+    ]
     return [
         separator.join([str(stamp), *map(repr, position + quat)])
         for stamp, position, quat in zip(stamps, POSITIONS, quats, strict=True)
@@ -60,7 +70,10 @@ def assert_is_the_trajectory(trajectory, stamps_ns=TRAJECTORY.stamps_ns):
     ("text", "stamp_ns"),
     [
         ("1317375625.661736", 1317375625661736000),
-        ("1317375625.6617361234", 1317375625661736123),  # a tenth digit is rounded
+        (
+            "1317375625.6617361234",
+            1317375625661736123,
+        ),  # a tenth digit is rounded
         (".5", 500_000_000),
         ("-0.000000001", -1),
     ],
@@ -87,7 +100,9 @@ def test_comments_empty_lines_tabs_and_a_byte_order_mark_are_skipped(file):
     assert hec.read_trajectory(path).stamps_ns.tolist() == [0, 1_000_000_000]
 
 
-def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(tmp_path):
+def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(
+    tmp_path,
+):
     random = np.random.default_rng(5)
     stamps_ns = np.sort(random.choice(2**60, 200, replace=False)) - 2**59
     written = Trajectory(stamps_ns, se3.exp(random.normal(size=(200, 6)) * 3))
@@ -147,7 +162,9 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             hec.read_trajectory(tmp_path / name)
-    with pytest.raises(ConfigError, match="is a folder: name the topic of the bag"):
+    with pytest.raises(
+        ConfigError, match="is a folder: name the topic of the bag"
+    ):
         hec.read_trajectory(tmp_path)
     with pytest.raises(InputError, match="cannot write .*absent"):
         write_trajectory(tmp_path / "absent" / "t.txt", TRAJECTORY)
@@ -158,10 +175,13 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
 
 def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
     lines = [
-        " ".join(map(repr, pose[:3].ravel().tolist())) for pose in TRAJECTORY.poses
+        " ".join(map(repr, pose[:3].ravel().tolist()))
+        for pose in TRAJECTORY.poses
     ]
     poses = file(lines, "poses.txt")
-    times = file([seconds(stamp) for stamp in TRAJECTORY.stamps_ns], "times.txt")
+    times = file(
+        [seconds(stamp) for stamp in TRAJECTORY.stamps_ns], "times.txt"
+    )
     assert_is_the_trajectory(hec.read_trajectory(poses, "kitti", times=times))
     message = r"poses\.txt: the poses have no stamps; name their column t, set `times`, or pair"
     with pytest.raises(InputError, match=message):
@@ -193,7 +213,10 @@ def test_kitti_has_its_stamps_in_a_file_of_their_own(file):
 def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
     names = ["time", ".header.stamp.secs", ".header.stamp.nsecs", ".child"]
     names += [f".pose.pose.position.{axis}" for axis in "xyz"]
-    names += [*(f".pose.pose.orientation.{axis}" for axis in "xyzw"), ".covariance"]
+    names += [
+        *(f".pose.pose.orientation.{axis}" for axis in "xyzw"),
+        ".covariance",
+    ]
     lines = []
     for number, row in enumerate(rows(TRAJECTORY.stamps_ns)):
         stamp, _, pose = row.partition(",")
@@ -211,7 +234,9 @@ def test_without_a_header_the_columns_must_be_named(file):
     with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))
-    with pytest.raises(InputError, match=r"line 1: expected 9 columns: .*; found 8"):
+    with pytest.raises(
+        InputError, match=r"line 1: expected 9 columns: .*; found 8"
+    ):
         hec.read_trajectory(path, "csv", columns=f"{WXYZ},extra")
     with pytest.raises(
         InputError, match="line 1: expected 8 numbers or more, timestamp, px"
@@ -250,7 +275,9 @@ def test_columns_that_are_missing_or_not_clear(file, header, message):
 @pytest.mark.parametrize(
     ("unit", "ns"), [("s", 10**9), ("ms", 10**6), ("us", 10**3), ("ns", 1)]
 )
-def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, unit, ns):
+def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(
+    file, unit, ns
+):
     stamps_ns = START_NS // 10**9 * 10**9 + 100_000_000 * np.arange(30)
     relative_ns = stamps_ns - stamps_ns[0]
 
@@ -264,11 +291,15 @@ def test_units_of_stamps_are_recognised_named_or_taken_from_the_header(file, uni
     assert_is_the_trajectory(hec.read_trajectory(absolute), stamps_ns)
     relative = in_unit(relative_ns.tolist())
     path = file(rows(relative, separator=" "), "relative.txt")
-    assert_is_the_trajectory(hec.read_trajectory(path, stamp_unit=unit), relative_ns)
+    assert_is_the_trajectory(
+        hec.read_trajectory(path, stamp_unit=unit), relative_ns
+    )
     for name in (f"time [{unit}]", f"t_{unit}", f"timestamp ({unit})"):
         named = file([f"{name},{XYZW[2:]}", *rows(relative)])
         assert_is_the_trajectory(hec.read_trajectory(named, "csv"), relative_ns)
-    message = r"unclear; read as \w+, the poses are .* s apart; set `stamp_unit`"
+    message = (
+        r"unclear; read as \w+, the poses are .* s apart; set `stamp_unit`"
+    )
     if unit != "s":
         with pytest.raises(InputError, match=message):
             hec.read_trajectory(path)
@@ -278,7 +309,9 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     order = [*range(10), 9, 12, 11, 10, *range(13, 30), 3]
     lines = rows(TRAJECTORY.stamps_ns)
     path = file([XYZW, *(lines[index] for index in order)])
-    message = r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
+    message = (
+        r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
+    )
     with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
     message = "decrease at 3 of 32 poses; the poses were sorted; dropped 2 with a repeated stamp"
@@ -294,7 +327,10 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
             "unknown unit of stamps 'minutes'; known are s, ms, us",
         ),
         ({"format": "bvh"}, "unknown trajectory format 'bvh'; known are tum"),
-        ({"format": "kitti", "columns": "t"}, "columns can be set for format csv only"),
+        (
+            {"format": "kitti", "columns": "t"},
+            "columns can be set for format csv only",
+        ),
         (
             {"format": "csv", "times": "t"},
             "a file of times belongs to format kitti only",
@@ -334,7 +370,9 @@ def test_calibrate_reads_each_file_in_its_own_format(tmp_path, file, capsys):
             in err
         )
         document = json.loads(out)
-        assert_allclose(document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3)
+        assert_allclose(
+            document["T_parent_child"]["matrix"], T_PARENT_CHILD, atol=1e-3
+        )
     assert main([*command, "--format", "tum"]) == 2
     assert (
         "columns can be set for format csv only; the format is tum"

@@ -18,8 +18,13 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.geodetic import LocalOrigin
-from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
-from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
+from hand_eye_calib.formats.trajectory_files.reading import (
+    read_trajectory_files,
+)
 from hand_eye_calib.offline.cli.main import main
 
 SCALAR_FIRST = [3, 0, 1, 2]
@@ -32,7 +37,9 @@ def write_unnamed(path, trajectory, order, separator=" "):
     values = np.c_[trajectory.poses[:, :3, 3], quats].tolist()
     stamps = (trajectory.stamps_ns / 1e9).tolist()
     rows = zip(stamps, values, strict=True)
-    path.write_text("".join(f"{separator.join(map(repr, [s, *v]))}\n" for s, v in rows))
+    path.write_text(
+        "".join(f"{separator.join(map(repr, [s, *v]))}\n" for s, v in rows)
+    )
     return path
 
 
@@ -72,7 +79,9 @@ def test_motion_or_start_tell_the_order(tmp_path, truth, sentence):
                 write_unnamed(tmp_path / name, truth, order, separator)
             )
             assert_allclose(trajectory.poses, truth.poses, atol=1e-12)
-            guesses = [text for text in guesses if "is read as format" not in text]
+            guesses = [
+                text for text in guesses if "is read as format" not in text
+            ]
             assert len(guesses) == (order == SCALAR_FIRST)
             assert all(
                 "read with the scalar first" in text and sentence in text
@@ -82,11 +91,10 @@ def test_motion_or_start_tell_the_order(tmp_path, truth, sentence):
 
 def test_an_order_that_nothing_tells_is_said(tmp_path):
     truth = as_trajectory(
-        se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0])) @ wandering_poses(200)
+        se3.exp(np.array([1.0, 2.0, 3.0, 1.0, 0.5, -1.0]))
+        @ wandering_poses(200)
     )
-    sentence = (
-        "does not name its columns or the order of the quaternion; read with the scalar"
-    )
+    sentence = "does not name its columns or the order of the quaternion; read with the scalar"
     for name, separator, is_said in (("a.csv", ",", 1), ("a.txt", " ", 0)):
         trajectory, guesses = read(
             write_unnamed(tmp_path / name, truth, SCALAR_LAST, separator)
@@ -98,7 +106,9 @@ def test_an_order_that_nothing_tells_is_said(tmp_path):
 def test_only_auto_guesses(tmp_path):
     path = write_unnamed(tmp_path / "poses.mat", driven(), SCALAR_FIRST)
     assert read_trajectory_file(path).guesses == []
-    with pytest.raises(InputError, match="so their order is unknown; name the 8 with"):
+    with pytest.raises(
+        InputError, match="so their order is unknown; name the 8 with"
+    ):
         read_trajectory_file(path, "csv")
 
 
@@ -107,7 +117,9 @@ def table(path, header, *columns):
     stamps = np.arange(len(columns[0])) / 10
     rows = np.c_[stamps, np.transpose(columns)].tolist()
     path.write_text(
-        "\n".join([f"t,{header}", *(",".join(map(repr, row)) for row in rows), ""])
+        "\n".join(
+            [f"t,{header}", *(",".join(map(repr, row)) for row in rows), ""]
+        )
     )
     return path
 
@@ -133,11 +145,15 @@ def angles(seed=1):
         (".roll_degrees,.pitch_degrees,.yaw_degrees", 180 / np.pi, False),
     ],
 )
-def test_roll_pitch_and_yaw_in_degrees_or_radians(tmp_path, header, unit, is_said):
+def test_roll_pitch_and_yaw_in_degrees_or_radians(
+    tmp_path, header, unit, is_said
+):
     positions, rpy = angles()
     path = table(tmp_path / "a.csv", f"x,y,z,{header}", *positions, *rpy * unit)
     trajectory, guesses = read(path)
-    expected = se3.from_rotation_translation(se3.rotation_from_rpy(rpy.T), positions.T)
+    expected = se3.from_rotation_translation(
+        se3.rotation_from_rpy(rpy.T), positions.T
+    )
     assert_allclose(trajectory.poses, expected, atol=1e-12)
     word = "deg" if unit > 1 else "rad"
     sentences = [
@@ -158,14 +174,18 @@ def test_small_angles_in_degrees_are_read_by_the_name_of_their_unit(tmp_path):
     )
     trajectory, guesses = read(path)
     assert_allclose(trajectory.poses[1, :3, 3], [0.5, 0, 0])
-    assert_allclose(se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2))
+    assert_allclose(
+        se3.rotation_to_rpy(trajectory.poses[1, :3, :3])[2], np.radians(2)
+    )
     assert [text for text in guesses if "no column" in text] == [
         ": no column of heights: 0 is assumed",
         ": no columns of roll and pitch: 0 is assumed",
     ]
 
 
-def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(tmp_path):
+def test_a_compass_heading_is_clockwise_from_north_and_nose_up_is_positive(
+    tmp_path,
+):
     positions, rpy = angles()
     roll, pitch, yaw = rpy
     compass = np.degrees((np.pi / 2 - yaw) % (2 * np.pi))
@@ -196,7 +216,9 @@ def test_the_motion_tells_which_way_an_angle_is_counted(tmp_path):
             table(tmp_path / "a.csv", header, *positions, values)
         )
         assert_allclose(
-            np.cos(se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw),
+            np.cos(
+                se3.rotation_to_rpy(trajectory.poses[:, :3, :3])[:, 2] - yaw
+            ),
             1,
             atol=1e-12,
         )
@@ -222,7 +244,8 @@ def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):
     for order in (settings, settings[::-1]):
         for reading in read_trajectory_files(order):
             assert (
-                "read as that of the world in the sensor's frame" in reading.guesses[-1]
+                "read as that of the world in the sensor's frame"
+                in reading.guesses[-1]
             )
     first, second = (
         reading.trajectory.poses for reading in read_trajectory_files(settings)
@@ -281,11 +304,13 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(
     # The axes of the first position are tilted against those of the place by some 1e-5 rad.
     assert_allclose(trajectory.poses[:, :3, 3].T, expected, atol=2e-2)
     assert any(
-        "became metres east and north of the first position" in text for text in guesses
+        "became metres east and north of the first position" in text
+        for text in guesses
     )
     # East, north and up of the places turn against each other as the earth does.
     turned = se3.rotation_angle(
-        trajectory.poses[:, :3, :3] @ np.swapaxes(se3.rotation_from_rpy(rpy.T), 1, 2)
+        trajectory.poses[:, :3, :3]
+        @ np.swapaxes(se3.rotation_from_rpy(rpy.T), 1, 2)
     )
     assert 1e-4 < turned.max() < 1e-3
 
@@ -298,7 +323,11 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(
             [35, 35],
             "line 2: found latitude 139.7 deg, .* check whether both are swapped",
         ),
-        ([60.0, 60.0], [1, 361], "line 3: found latitude 60 deg, longitude 361 deg"),
+        (
+            [60.0, 60.0],
+            [1, 361],
+            "line 3: found latitude 60 deg, longitude 361 deg",
+        ),
         (
             [60.0, 91.0],
             [1, 1],
@@ -308,7 +337,9 @@ def test_latitude_and_longitude_become_metres_of_the_first_position(
     ],
 )
 def test_latitudes_that_cannot_be_are_refused(tmp_path, lat, lon, message):
-    path = table(tmp_path / "a.csv", "lat,lon,height,yaw", lat, lon, [0, 0], [0, 0])
+    path = table(
+        tmp_path / "a.csv", "lat,lon,height,yaw", lat, lon, [0, 0], [0, 0]
+    )
     with pytest.raises(InputError, match=message):
         read(path)
 
@@ -340,7 +371,9 @@ def test_published_files_need_no_options():
         ).trajectory
         assert_array_equal(trajectory.poses, named.poses)
     ins, _ = read(folder / "raw_bag1" / "bag1-novatel_data-inspvax.csv")
-    theirs = read_trajectory_file(folder / "bag1" / "INS_FCPE.mat", AUTO).trajectory
+    theirs = read_trajectory_file(
+        folder / "bag1" / "INS_FCPE.mat", AUTO
+    ).trajectory
     # Their sensor has x to the right and y forward; their roll and pitch are exchanged.
     headings = [np.arctan2(ins.poses[:, 1, 0], ins.poses[:, 0, 0])]
     headings.append(np.arctan2(theirs.poses[:, 1, 1], theirs.poses[:, 0, 1]))

@@ -36,7 +36,10 @@ def rows(*names):
 
 
 def assert_same(trajectory, tolerance_ns=STEP_NS):
-    assert np.abs(trajectory.stamps_ns - TRAJECTORY.stamps_ns).max() <= tolerance_ns
+    assert (
+        np.abs(trajectory.stamps_ns - TRAJECTORY.stamps_ns).max()
+        <= tolerance_ns
+    )
     assert_allclose(trajectory.poses, TRAJECTORY.poses, atol=1e-12)
 
 
@@ -57,7 +60,9 @@ class TestReading:
             hec.read_trajectory(rows(*reversed(tum)))
 
     def test_a_topic_of_a_bag(self, tmp_path):
-        write_bag(tmp_path / "bag", {"/lidar": (TRAJECTORY, "nav_msgs/msg/Odometry")})
+        write_bag(
+            tmp_path / "bag", {"/lidar": (TRAJECTORY, "nav_msgs/msg/Odometry")}
+        )
         assert_same(hec.read_trajectory(tmp_path / "bag", topic="/lidar"), 0)
 
     @pytest.mark.parametrize(
@@ -77,10 +82,30 @@ class TestReading:
                 r"expected a path, .* found an array \(\)",
             ),
             ({"a": 1}, {}, InputError, "expected a path, .* found dict"),
-            (np.zeros((3, 5)), {}, InputError, r"of t, x, .*; found an array \(3, 5\)"),
-            (POSES, {"times": SECONDS, "columns": "x"}, ConfigError, "to text files"),
-            (POSES, {"times": SECONDS, "stamp_unit": "h"}, ConfigError, "unknown unit"),
-            (POSES, {"times": SECONDS, "format": "csv"}, ConfigError, "to text files"),
+            (
+                np.zeros((3, 5)),
+                {},
+                InputError,
+                r"of t, x, .*; found an array \(3, 5\)",
+            ),
+            (
+                POSES,
+                {"times": SECONDS, "columns": "x"},
+                ConfigError,
+                "to text files",
+            ),
+            (
+                POSES,
+                {"times": SECONDS, "stamp_unit": "h"},
+                ConfigError,
+                "unknown unit",
+            ),
+            (
+                POSES,
+                {"times": SECONDS, "format": "csv"},
+                ConfigError,
+                "to text files",
+            ),
             (POSES, {"topic": "/a"}, ConfigError, "for bags"),
             (POSES, {"times": SECONDS * np.nan}, InputError, "finite numbers"),
             (POSES, {"times": SECONDS * 1e12}, InputError, "too large"),
@@ -101,7 +126,9 @@ class TestReading:
             UserWarning, match="were sorted; dropped 1 with a repeated stamp"
         ):
             assert_same(
-                hec.read_trajectory(POSES[order], times=SECONDS[order], repair=True)
+                hec.read_trajectory(
+                    POSES[order], times=SECONDS[order], repair=True
+                )
             )
 
 
@@ -122,13 +149,17 @@ class TestTables:
 
     def test_an_index_of_times_is_the_stamps(self):
         for zone in (None, "UTC"):
-            index = self.pd.to_datetime(TRAJECTORY.stamps_ns, utc=zone is not None)
+            index = self.pd.to_datetime(
+                TRAJECTORY.stamps_ns, utc=zone is not None
+            )
             frame = self.frame(t=0.0).set_index(index)
             assert_same(hec.read_trajectory(frame, times=frame.index), 0)
 
     def test_without_pandas_one_line_says_so(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "pandas", None)
-        with pytest.raises(MissingDependencyError, match=r"pip install '\.\[notebook"):
+        with pytest.raises(
+            MissingDependencyError, match=r"pip install '\.\[notebook"
+        ):
             calibration().to_frame()
 
     def test_stamps_keep_their_digits_and_whole_numbers_are_in_the_unit_of_their_size(
@@ -140,24 +171,37 @@ class TestTables:
         ).stamps_ns[0]
         assert abs(int(stamp_ns) - exact) <= Fraction(1, 2)
         for factor in (1, 10**3, 10**6, 10**9):
-            trajectory = hec.read_trajectory(POSES[:1], times=[1_700_000_000 * factor])
+            trajectory = hec.read_trajectory(
+                POSES[:1], times=[1_700_000_000 * factor]
+            )
             assert trajectory.stamps_ns == [1_700_000_000 * 10**9]
-        assert hec.read_trajectory(POSES[:1], times=[5], stamp_unit="ms").stamps_ns == [
-            5_000_000
-        ]
+        assert hec.read_trajectory(
+            POSES[:1], times=[5], stamp_unit="ms"
+        ).stamps_ns == [5_000_000]
 
 
 class TestShowing:
     def test_a_figure_shows_both_sensors_from_three_sides(self):
-        result = hec.calibrate(as_trajectory(POSES), as_trajectory(child_of(POSES)))
+        result = hec.calibrate(
+            as_trajectory(POSES), as_trajectory(child_of(POSES))
+        )
         assert len(repr(result)) < 600
         assert len(repr(TRAJECTORY)) < 100
         for source in (result, hec.Calibration.from_dict(result.to_dict())):
             figure = hec.plot(source)
-            seen = [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
-            assert seen == [("x (m)", "y (m)"), ("x (m)", "z (m)"), ("y (m)", "z (m)")]
+            seen = [
+                (panel.get_xlabel(), panel.get_ylabel())
+                for panel in figure.axes
+            ]
+            assert seen == [
+                ("x (m)", "y (m)"),
+                ("x (m)", "z (m)"),
+                ("y (m)", "z (m)"),
+            ]
             (ellipse,) = figure.axes[0].patches
-            assert_allclose(ellipse.get_center(), result.translation[:2], atol=1e-9)
+            assert_allclose(
+                ellipse.get_center(), result.translation[:2], atol=1e-9
+            )
             assert figure._repr_png_().startswith(b"\x89PNG")
             panels = figure.subplots(1, 3)
             assert source.plot(ax=panels) is figure
@@ -166,6 +210,10 @@ class TestShowing:
             dataclasses.replace(dof, sigma=np.inf) if dof.name == "z" else dof
             for dof in result.observability
         )
-        figure = hec.plot(dataclasses.replace(result, observability_measured=hidden))
+        figure = hec.plot(
+            dataclasses.replace(result, observability_measured=hidden)
+        )
         assert [len(panel.patches) for panel in figure.axes] == [1, 0, 0]
-        assert "Unknown along z: the dashed line." in figure._supxlabel.get_text()
+        assert (
+            "Unknown along z: the dashed line." in figure._supxlabel.get_text()
+        )

@@ -17,14 +17,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motions import as_trajectory, child_of, disturbed, messages, wandering_poses
+from motions import (
+    as_trajectory,
+    child_of,
+    disturbed,
+    messages,
+    wandering_poses,
+)
 
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.journal import JournalWriter
 from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 
-FORMATS = ("mcap", "sqlite3", "rosbag1", "tum", "kitti", "euroc", "csv", "journal")
+FORMATS = (
+    "mcap",
+    "sqlite3",
+    "rosbag1",
+    "tum",
+    "kitti",
+    "euroc",
+    "csv",
+    "journal",
+)
 N_INPUTS = int(os.environ.get("FUZZ_INPUTS", 24 * len(FORMATS))) // len(FORMATS)
 FIRST_SEED = 1 if N_INPUTS == 24 else 1000
 LONGEST_S = 10.0
@@ -45,7 +60,8 @@ ODD = ("", "nan", "inf", "-inf", "1e400", "1e154", "-1e300", "0x10", "1_0", "1e-
 def text_of(format):
     """A file of PARENT, and of its stamps for format kitti."""
     stamps = [
-        f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in PARENT.stamps_ns.tolist()
+        f"{stamp // 10**9}.{stamp % 10**9:09d}"
+        for stamp in PARENT.stamps_ns.tolist()
     ]
     rows = np.c_[POSES[:, :3, 3], se3.to_quat_xyzw(POSES)].tolist()
     if format == "kitti":
@@ -56,7 +72,9 @@ def text_of(format):
         stamps = PARENT.stamps_ns.tolist()
         rows = [[*row[:3], row[6], *row[3:6]] for row in rows]
     separator = " " if format == "tum" else ","
-    lines = [separator.join(map(str, row)) for row in np.c_[stamps, rows].tolist()]
+    lines = [
+        separator.join(map(str, row)) for row in np.c_[stamps, rows].tolist()
+    ]
     if format == "csv":
         lines.insert(0, "t,x,y,z,qx,qy,qz,qw")
     return "\n".join(lines), stamps
@@ -85,7 +103,9 @@ def whole(format):
             text, stamps = text_of(format)
             (folder / "parent").write_text(text)
             (folder / "times").write_text("\n".join(map(str, stamps)))
-        kept = [path for path in folder.iterdir() if path.name != "metadata.yaml"]
+        kept = [
+            path for path in folder.iterdir() if path.name != "metadata.yaml"
+        ]
         return {path.name: path.read_bytes() for path in kept}
 
 
@@ -103,7 +123,11 @@ def damaged(chance, data):
             + chance.choice([flipped, flipped, b"", piece * 2, bytes(length)])
             + after
         )
-    return data[: chance.randrange(len(data) + 1)] if chance.random() < 0.3 else data
+    return (
+        data[: chance.randrange(len(data) + 1)]
+        if chance.random() < 0.3
+        else data
+    )
 
 
 def rewritten(chance, data):
@@ -117,7 +141,9 @@ def rewritten(chance, data):
             for w in line.split(separator)
         ]
         lines[k] = (
-            chance.choice(ODD) if chance.random() < rate else separator.join(words)
+            chance.choice(ODD)
+            if chance.random() < rate
+            else separator.join(words)
         )
     if chance.random() < 0.2:
         chance.shuffle(lines)
@@ -136,7 +162,9 @@ def exercise(run, format, seed, folder):
         write_trajectory(folder / "child", CHILD)
         files |= {"child": (folder / "child").read_bytes()}
         guess = [] if chance.random() < 0.5 else ["--parent-format", format]
-        times = ["--parent-times", folder / "times"] if format == "kitti" else []
+        times = (
+            ["--parent-times", folder / "times"] if format == "kitti" else []
+        )
         command = [
             "calibrate",
             folder / "parent",
@@ -176,7 +204,9 @@ def test_damaged_inputs_end_in_an_answer_or_in_one_line(
     try:
         for seed in range(FIRST_SEED, FIRST_SEED + N_INPUTS):
             # Whatever takes minutes is a hang.
-            faulthandler.dump_traceback_later(600, exit=True, file=sys.__stderr__)
+            faulthandler.dump_traceback_later(
+                600, exit=True, file=sys.__stderr__
+            )
             began = time.process_time()
             codes.append(exercise(run, format, seed, tmp_path / "input"))
             assert time.process_time() - began < LONGEST_S, seed
@@ -185,6 +215,8 @@ def test_damaged_inputs_end_in_an_answer_or_in_one_line(
     assert not [*(tmp_path / "TMPDIR").iterdir()]
     # Memory is measured in a process of its own. ru_maxrss would be that of its parent.
     if N_INPUTS > 24:
-        peak = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+        peak = re.search(
+            r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text()
+        )
         assert int(peak[1]) / 1024 < LARGEST_MB
     assert {code in (0, 3) for code in codes} == {True, False}, codes

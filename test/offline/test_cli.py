@@ -105,7 +105,10 @@ def test_replay_finds_the_extrinsic_and_says_it_in_both_directions(
     assert_allclose(np.array(rows, dtype=float), truth, atol=1e-3)
     assert re.search(r"  yaw +\S+ \+/- \d\S* deg  \(.* measured, ", out)
     assert "\nNext\n" not in out
-    assert "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher" in out
+    assert (
+        "\nTo publish it (USE)\n  ros2 run tf2_ros static_transform_publisher"
+        in out
+    )
 
 
 def test_json_is_one_document_on_stdout(run, new_bag):
@@ -121,7 +124,10 @@ def test_json_is_one_document_on_stdout(run, new_bag):
         "B2",
         "ok",
     )
-    assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
+    assert (document["parent_frame"], document["child_frame"]) == (
+        "lidar",
+        "camera",
+    )
     assert document["inputs"]["bag"] == bag
     assert document["inputs"]["parent"] == {
         "topic": PARENT_TOPIC, "messages": 120, "refused_duplicate": 0, "refused_late": 0,
@@ -162,10 +168,19 @@ def test_calibrate_on_files_gives_what_replay_gives(run, new_bag, tmp_path):
         from_bag["T_parent_child"]["matrix"],
         atol=1e-12,
     )
-    stamps = {"first_stamp_ns": START_NS, "last_stamp_ns": START_NS + 11_900_000_000}
-    assert from_files["inputs"]["child"] == {"file": files[1], "poses": 120, **stamps}
+    stamps = {
+        "first_stamp_ns": START_NS,
+        "last_stamp_ns": START_NS + 11_900_000_000,
+    }
+    assert from_files["inputs"]["child"] == {
+        "file": files[1],
+        "poses": 120,
+        **stamps,
+    }
     # two files are used whole, a stream is bounded
-    options = [document["inputs"]["options"] for document in (from_files, from_bag)]
+    options = [
+        document["inputs"]["options"] for document in (from_files, from_bag)
+    ]
     assert [document.pop("max_pairs") for document in options] == [120, 5000]
     assert options[0] == options[1]
 
@@ -174,7 +189,9 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     out_dir = tmp_path / "result"
     code, text, err = run("replay", new_bag(), *TOPICS, "--out", out_dir)
     wrote = f"hand_eye_calib: note: wrote {out_dir}/"
-    files = "extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py"
+    files = (
+        "extrinsic.yaml, extrinsic.urdf.xacro and static_transform.launch.py"
+    )
     assert (code, err) == (0, f"{wrote}{files}\n{wrote}report.html\n")
     files = [
         "extrinsic.urdf.xacro",
@@ -186,13 +203,20 @@ def test_out_saves_what_info_shows(run, new_bag, tmp_path):
     assert run("info", out_dir) == (0, text, "")
     document = json.loads(run("info", out_dir / "extrinsic.yaml", "--json")[1])
     assert document == load_result(out_dir).to_dict()
-    provenance = yaml.safe_load((out_dir / "extrinsic.yaml").read_text())["provenance"]
+    provenance = yaml.safe_load((out_dir / "extrinsic.yaml").read_text())[
+        "provenance"
+    ]
     assert provenance["inputs"]["child"]["topic"] == CHILD_TOPIC
     (file,) = provenance["inputs"]["files"]
-    assert file["sha256"] == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
+    assert (
+        file["sha256"]
+        == hashlib.sha256(Path(file["file"]).read_bytes()).hexdigest()
+    )
     assert provenance["parameters"]["method"] == "auto"
     again = run("replay", file["file"], *TOPICS, "--out", out_dir)
-    assert f"launch.py; the earlier files are in {out_dir}/previous\n" in again[2]
+    assert (
+        f"launch.py; the earlier files are in {out_dir}/previous\n" in again[2]
+    )
 
 
 def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag, tmp_path):
@@ -202,7 +226,9 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag, tmp_path):
     assert re.search(r"^  z +unknown$", out, flags=re.MULTILINE)
     assert out.startswith("USE WITH CARE: all but z; measure z by hand\n")
     command = next(
-        line for line in out.splitlines() if "static_transform_publisher" in line
+        line
+        for line in out.splitlines()
+        if "static_transform_publisher" in line
     )
     assert " --z MEASURE_Z_BY_HAND --qx " in command
     assert (
@@ -210,7 +236,8 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag, tmp_path):
         in out
     )
     assert (
-        "\n  measure z by hand, then add --prior z=0.50+/-0.02 with your value" in out
+        "\n  measure z by hand, then add --prior z=0.50+/-0.02 with your value"
+        in out
     )
     path = tmp_path / "drive"
     code, out, err = run("replay", path, *TOPICS, "--prior", "z=0.1±0.01")
@@ -223,7 +250,9 @@ def test_planar_motion_is_said_to_leave_z_unknown(run, new_bag, tmp_path):
 
 def in_millimetres(parent, child):
     positions = 1000.0 * se3.translation_of(child.poses)
-    poses = se3.from_rotation_translation(se3.rotation_of(child.poses), positions)
+    poses = se3.from_rotation_translation(
+        se3.rotation_of(child.poses), positions
+    )
     return parent, dataclasses.replace(child, poses=poses)
 
 
@@ -239,7 +268,11 @@ def late(parent, child):
         (drive(planar=True), ["--prior", "y=-0.1+/-0.02"], 0),
         (in_millimetres(*drive()), ["--scale", "none"], 1),
         (in_millimetres(*drive()), ["--scale=0.5"], 1),
-        (late(*drive(600)), ["--time-offset", "0.02", "--prior", "z=0.3+/-0.2"], 1),
+        (
+            late(*drive(600)),
+            ["--time-offset", "0.02", "--prior", "z=0.3+/-0.2"],
+            1,
+        ),
     ],
 )
 def test_every_printed_command_runs_as_it_is(
@@ -252,7 +285,9 @@ def test_every_printed_command_runs_as_it_is(
     assert len(printed) == n_commands
     for command in printed:
         typed = shlex.split(command)
-        names = [word.partition("=")[0] for word in typed if word.startswith("--")]
+        names = [
+            word.partition("=")[0] for word in typed if word.startswith("--")
+        ]
         assert len(names) == len({*names}), command
         code, _, err = run(*typed)
         assert code in (0, 3), err
@@ -261,13 +296,21 @@ def test_every_printed_command_runs_as_it_is(
 def test_each_reason_stands_above_what_to_do_about_it(run, new_bag, tmp_path):
     """The headline of planar motion names the second reason, too."""
     assert (
-        run("replay", new_bag(*drive(planar=True)), *TOPICS, "--out", tmp_path / "out")[
-            0
-        ]
+        run(
+            "replay",
+            new_bag(*drive(planar=True)),
+            *TOPICS,
+            "--out",
+            tmp_path / "out",
+        )[0]
         == 3
     )
-    jumps = written_finding("jumps", Severity.WARNING, "many jumps", "find out why")
-    calibration = dataclasses.replace(load_result(tmp_path / "out"), findings=(jumps,))
+    jumps = written_finding(
+        "jumps", Severity.WARNING, "many jumps", "find out why"
+    )
+    calibration = dataclasses.replace(
+        load_result(tmp_path / "out"), findings=(jumps,)
+    )
     lines = as_lines(calibration)
     assert lines[0] == "USE WITH CARE: all but z; measure z by hand; many jumps"
     assert lines[1:5] == [
@@ -341,16 +384,24 @@ def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
         "replay", tmp_path / "absent", *TOPICS
     )
     line = refused(
-        "replay", new_bag(), "--parent-topic", "/odom", "--child-topic", CHILD_TOPIC
+        "replay",
+        new_bag(),
+        "--parent-topic",
+        "/odom",
+        "--child-topic",
+        CHILD_TOPIC,
     )
     assert "no topic /odom in " in line
     topics = [
-        f"{topic} ({ODOMETRY}, 120 messages)" for topic in (CHILD_TOPIC, PARENT_TOPIC)
+        f"{topic} ({ODOMETRY}, 120 messages)"
+        for topic in (CHILD_TOPIC, PARENT_TOPIC)
     ]
     assert ", ".join(topics) in line
 
 
-def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_path):
+def test_a_misspelt_name_is_answered_with_a_similar_one(
+    refused, new_bag, tmp_path
+):
     file = tmp_path / "camera.tum"
     file.write_text("0 0 0 0 0 0 0 1\n")
     line = refused("calibrate", tmp_path / "camra.tum", file)
@@ -359,7 +410,12 @@ def test_a_misspelt_name_is_answered_with_a_similar_one(refused, new_bag, tmp_pa
     line = refused("replay", bag.with_name(f"{bag.name}s"), *TOPICS)
     assert line.endswith(f"; did you mean {bag.name}?")
     line = refused(
-        "replay", bag, "--parent-topic", "/lidar/odo", "--child-topic", CHILD_TOPIC
+        "replay",
+        bag,
+        "--parent-topic",
+        "/lidar/odo",
+        "--child-topic",
+        CHILD_TOPIC,
     )
     assert f"; did you mean {PARENT_TOPIC}? The bag has" in line
 
@@ -373,7 +429,10 @@ def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(
         name: (poses, ODOMETRY)
         for name, poses in zip(names, (parent, child, child), strict=True)
     }
-    streams["/gnss/odom"] = (dataclasses.replace(child, sensor_frame="gnss"), ODOMETRY)
+    streams["/gnss/odom"] = (
+        dataclasses.replace(child, sensor_frame="gnss"),
+        ODOMETRY,
+    )
     bag = tmp_path / "three bags"
     write_bag(bag, streams)
     line = refused("calibrate", bag)
@@ -396,7 +455,9 @@ def test_a_bag_without_an_obvious_pair_is_answered_with_a_command_that_runs(
 def test_a_file_that_is_given_twice_is_refused(run, command):
     code, out, err = run(*command, "camera.tum", "camera.tum")
     assert (code, out) == (2, "")
-    assert "error: camera.tum appears twice: pass the file of each sensor" in err
+    assert (
+        "error: camera.tum appears twice: pass the file of each sensor" in err
+    )
 
 
 def test_nan_is_left_out_and_counted_by_topic(run, new_bag):
@@ -415,9 +476,16 @@ def test_nan_is_left_out_and_counted_by_topic(run, new_bag):
 def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
     seen = []
     monkeypatch.setattr(
-        "hand_eye_calib.online.ros.node.main", lambda args: seen.append(args) or 5
+        "hand_eye_calib.online.ros.node.main",
+        lambda args: seen.append(args) or 5,
     )
-    arguments = ["--ros-args", "-p", "method:=dnl", "-r", "parent_odom:=/lidar/odom"]
+    arguments = [
+        "--ros-args",
+        "-p",
+        "method:=dnl",
+        "-r",
+        "parent_odom:=/lidar/odom",
+    ]
     assert main(["calibrator", *arguments]) == 5
     assert main(["calibrator"]) == 5
     assert seen == [arguments, []]
@@ -425,7 +493,9 @@ def test_the_node_gets_its_arguments_as_they_are(monkeypatch):
 
 def test_commands_that_need_ros_say_how_to_get_it(refused, monkeypatch):
     for module in [
-        name for name in sys.modules if name.startswith("hand_eye_calib.online.ros")
+        name
+        for name in sys.modules
+        if name.startswith("hand_eye_calib.online.ros")
     ]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "rclpy", None)
@@ -465,7 +535,9 @@ def test_interrupt_ends_quietly(tmp_path):
     assert (process.returncode, out, err) == (130, "", "")
 
 
-def test_a_reader_that_goes_away_is_no_error_and_files_are_written(tmp_path, new_bag):
+def test_a_reader_that_goes_away_is_no_error_and_files_are_written(
+    tmp_path, new_bag
+):
     readable, writable = os.pipe()
     os.close(readable)
     process = start(
@@ -474,7 +546,9 @@ def test_a_reader_that_goes_away_is_no_error_and_files_are_written(tmp_path, new
     lines = process.communicate()[1].splitlines()
     os.close(writable)
     assert (process.returncode, len(lines)) == (141, 2)
-    assert all(line.startswith("hand_eye_calib: note: wrote ") for line in lines)
+    assert all(
+        line.startswith("hand_eye_calib: note: wrote ") for line in lines
+    )
     assert (tmp_path / "out" / "report.html").exists()
 
 
@@ -526,6 +600,12 @@ def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
 
 
 def test_options_are_printed_as_they_are_typed():
-    options = {"prior.z": "VALUE+/-SIGMA", "max_gap": 0.2, "target.translation": 0.01}
+    options = {
+        "prior.z": "VALUE+/-SIGMA",
+        "max_gap": 0.2,
+        "target.translation": 0.01,
+    }
     typed = typed_options(options.items())
-    assert typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"
+    assert (
+        typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"
+    )

@@ -37,8 +37,14 @@ def test_help_fits_a_screen_and_names_options_that_exist(run, command):
 def test_help_lists_every_option_with_its_default(run):
     code, out, _ = run("calibrate", "--help", "all")
     assert code == 0
-    assert out.startswith("usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n")
-    assert out.index("--method") < out.index("rarely needed") < out.index("--max-gap")
+    assert out.startswith(
+        "usage: hand_eye_calib calibrate [OPTION ...] PATH ...\n"
+    )
+    assert (
+        out.index("--method")
+        < out.index("rarely needed")
+        < out.index("--max-gap")
+    )
     words = " ".join(out.partition("\nexamples:")[0].split())
     assert " --prior AXIS=VALUE+/-SIGMA " in words
     for field in dataclasses.fields(CalibratorConfig):
@@ -49,15 +55,21 @@ def test_help_lists_every_option_with_its_default(run):
         entry = entry[: entry.find(" --", 1)]
         assert field.metadata["doc"] in entry, name
         assert (
-            f"Unit: {field.metadata['unit']}" in entry or not field.metadata["unit"]
+            f"Unit: {field.metadata['unit']}" in entry
+            or not field.metadata["unit"]
         ), name
-        assert f"Default: {field.default}." in entry or field.default == "", name
+        assert f"Default: {field.default}." in entry or field.default == "", (
+            name
+        )
 
 
 @pytest.mark.parametrize(
     ("options", "changed"),
     [
-        (["--keyframe-min-translation", "0.5"], {"keyframe_min_translation": 0.5}),
+        (
+            ["--keyframe-min-translation", "0.5"],
+            {"keyframe_min_translation": 0.5},
+        ),
         (["--time-offset", "-1e-3"], {"time_offset": -1e-3}),
         (
             ["--prior", "z=-1.85+/-0.02", "--prior", "yaw=-90deg+/-2deg"],
@@ -78,11 +90,16 @@ def parsed(options):
     """The configuration that ``calibrate`` makes of its options."""
     import argparse
 
-    from hand_eye_calib.offline.cli.options import add_config_arguments, options_from
+    from hand_eye_calib.offline.cli.options import (
+        add_config_arguments,
+        options_from,
+    )
 
     parser = argparse.ArgumentParser()
     add_config_arguments(parser)
-    return CalibratorConfig.from_options(options_from(parser.parse_args(options)))
+    return CalibratorConfig.from_options(
+        options_from(parser.parse_args(options))
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,8 +110,14 @@ def parsed(options):
             ["calibrate", str(ROOT / "README.md")],
             "is one trajectory file: pass those of two",
         ),
-        (["calibrate", "a.tum", "b.mcap"], "b.mcap is a bag, and another path is not"),
-        (["check", "a.mcap", "b.mcap"], "expected one bag or two trajectory files"),
+        (
+            ["calibrate", "a.tum", "b.mcap"],
+            "b.mcap is a bag, and another path is not",
+        ),
+        (
+            ["check", "a.mcap", "b.mcap"],
+            "expected one bag or two trajectory files",
+        ),
         (
             ["replay", "bag", "--methd", "dnl"],
             "unknown '--methd'; did you mean --method?",
@@ -115,14 +138,20 @@ def parsed(options):
         (["info", "a", "b"], "unknown 'b'"),
         (["chek", "bag"], "did you mean check?"),
         (["info"], "the following arguments are required: RESULT"),
-        (["replay", "bag", "--vehicle", "a"], "--vehicle is an option of batch"),
+        (
+            ["replay", "bag", "--vehicle", "a"],
+            "--vehicle is an option of batch",
+        ),
         (
             ["replay", "bag", "--batch", "fleet"],
             "--batch cannot be combined with PATH or --list",
         ),
         (["replay", "--batch", "none*"], "no bag matches none*"),
         (["watch", "--web", "high"], "expected PORT or HOST:PORT, got 'high'"),
-        (["watch", "--web", "99999"], "expected PORT or HOST:PORT, got '99999'"),
+        (
+            ["watch", "--web", "99999"],
+            "expected PORT or HOST:PORT, got '99999'",
+        ),
         (
             ["replay"],
             "usage: hand_eye_calib replay [OPTION ...] PATH ...\n\nexamples:\n",
@@ -158,10 +187,14 @@ def config_file(tmp_path):
     ],
 )
 def test_config_file_plain_or_for_ros(config_file, text):
-    expected = CalibratorConfig(method="dnl", threshold=1e-3, keyframe_min_interval=1.0)
+    expected = CalibratorConfig(
+        method="dnl", threshold=1e-3, keyframe_min_interval=1.0
+    )
     assert parsed(config_file(text)) == expected
     options = ["--method", "dnlo", "--target-translation", "5cm"]
-    other = dataclasses.replace(expected, method="dnlo", target_translation=0.05)
+    other = dataclasses.replace(
+        expected, method="dnlo", target_translation=0.05
+    )
     assert parsed([*config_file(text), *options]) == other
 
 
@@ -208,7 +241,10 @@ def test_config_files_that_are_wrong_end_with_usage_error(
 
 
 def test_the_sample_in_the_package_gives_its_true_extrinsic(capsys):
-    assert main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"]) == 0
+    assert (
+        main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--json"])
+        == 0
+    )
     matrix = json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
     truth = hec.read_trajectory(
         Path(hec.__file__).parent / "sample" / "truth.tum"
@@ -223,7 +259,9 @@ def test_the_truth_of_a_simulation_is_compared_whatever_its_ending(
     sample = Path(hec.__file__).parent / "sample" / "truth.tum"
     (tmp_path / name).write_bytes(sample.read_bytes())
     result = str(tmp_path / "result")
-    main(["calibrate", "sample:lidar.tum", "sample:camera.tum", "--out", result])
+    main(
+        ["calibrate", "sample:lidar.tum", "sample:camera.tum", "--out", result]
+    )
 
     assert main(["compare", result, "--with", str(tmp_path / name)]) == 0
     assert "same" in capsys.readouterr().out

@@ -71,7 +71,9 @@ def write_session(directory, options, *recorded):
 def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
     run, bag, tmp_path, folder
 ):
-    write_session(tmp_path / "live" / "journal", {"method": "park", "reference": "B7"})
+    write_session(
+        tmp_path / "live" / "journal", {"method": "park", "reference": "B7"}
+    )
     code, out, err = run(tmp_path / folder, "--reference", "B5", "--json")
     document = json.loads(out)
     assert (code, err) == (0, "")
@@ -82,7 +84,9 @@ def test_a_journal_gives_what_a_bag_gives_with_the_options_of_its_session(
     )
     assert document["inputs"]["child"]["topic"] == "/b"
     assert document["inputs"]["journal"] == str(tmp_path / "live" / "journal")
-    of_bag = run(bag, *STREAMS, "--method", "park", "--reference", "B5", "--json")[1]
+    of_bag = run(
+        bag, *STREAMS, "--method", "park", "--reference", "B5", "--json"
+    )[1]
     assert np.array_equal(matrix(out), matrix(of_bag))
 
 
@@ -124,19 +128,30 @@ def test_frames_stand_for_topics(run, bag, tmp_path):
         messages.append((ns, "/tf", TF, tf_message(both)))
     path = write_messages(tmp_path / "tf", messages)
     code, out, err = run(
-        path, "--parent-topic", "map:lidar", "--child-topic", "odom:camera", "--json"
+        path,
+        "--parent-topic",
+        "map:lidar",
+        "--child-topic",
+        "odom:camera",
+        "--json",
     )
     document = json.loads(out)
     assert (code, err) == (0, "")
-    assert (document["parent_frame"], document["child_frame"]) == ("lidar", "camera")
+    assert (document["parent_frame"], document["child_frame"]) == (
+        "lidar",
+        "camera",
+    )
     assert document["inputs"]["child"]["topic"] == "transform odom:camera"
-    assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
+    assert_allclose(
+        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
+    )
     code, out, err = run(
         path, "--parent-topic", "map:lidar", "--child-topic", "odom:radar"
     )
     assert (code, out) == (1, "")
     assert (
-        "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera" in err
+        "no frame 'radar' in the bag's transforms; it has map:lidar, odom:camera"
+        in err
     )
 
 
@@ -144,10 +159,19 @@ def test_a_path_and_a_topic_of_two_bags_together(run, bag, tmp_path):
     message = path_message(PARENT.stamps_ns, PARENT.poses)
     messages = [(PARENT.stamps_ns[-1], "/path", "nav_msgs/msg/Path", message)]
     path = write_messages(tmp_path / "path", messages)
-    both = ["--parent-topic", "/path", "--child-topic", "/b", "--parent-frame", "lidar"]
+    both = [
+        "--parent-topic",
+        "/path",
+        "--child-topic",
+        "/b",
+        "--parent-frame",
+        "lidar",
+    ]
     code, out, _ = run(bag, path, *both, "--json")
     assert code == 0
-    assert_allclose(matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9)
+    assert_allclose(
+        matrix(out), matrix(run(bag, *STREAMS, "--json")[1]), atol=1e-9
+    )
 
 
 def parts_of(tmp_path, slices, later_s=0.0):
@@ -188,7 +212,9 @@ def test_parts_that_continue_each_other_are_one_recording_in_any_order(
     ],
 )
 @pytest.mark.usefixtures("no_processes")
-def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, reason):
+def test_recordings_are_not_joined_but_give_one_result(
+    run, tmp_path, later_s, reason
+):
     paths = parts_of(tmp_path, 2 * [slice(0, 100)], later_s)
     code, out, err = run(*paths[::-1], *STREAMS, "--json", "--jobs", "1")
     assert f"are two recordings, not parts of one: {reason}" in err
@@ -203,16 +229,42 @@ def test_recordings_are_not_joined_but_give_one_result(run, tmp_path, later_s, r
 
 def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
     static = tf_message([(0, "base", "lidar", np.eye(4))])
-    write_messages(tmp_path / "tf", [(PARENT.stamps_ns[0], "/tf_static", TF, static)])
-    streams = {"/a": (PARENT, ODOMETRY), "/b": (CHILD, "geometry_msgs/msg/PoseStamped")}
+    write_messages(
+        tmp_path / "tf", [(PARENT.stamps_ns[0], "/tf_static", TF, static)]
+    )
+    streams = {
+        "/a": (PARENT, ODOMETRY),
+        "/b": (CHILD, "geometry_msgs/msg/PoseStamped"),
+    }
     write_bag(tmp_path / "drive", streams)
     code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list")
     assert (code, err) == (0, "")
-    rows = [line.split() for line in out.splitlines() if line.strip().startswith("/")]
-    assert ["/a", ODOMETRY, "100", "10.0", "Hz", "yes", PARENT.sensor_frame] in rows
-    assert ["/b", "geometry_msgs/msg/PoseStamped", "100", "10.0", "Hz", "yes"] in rows
+    rows = [
+        line.split()
+        for line in out.splitlines()
+        if line.strip().startswith("/")
+    ]
+    assert [
+        "/a",
+        ODOMETRY,
+        "100",
+        "10.0",
+        "Hz",
+        "yes",
+        PARENT.sensor_frame,
+    ] in rows
+    assert [
+        "/b",
+        "geometry_msgs/msg/PoseStamped",
+        "100",
+        "10.0",
+        "Hz",
+        "yes",
+    ] in rows
     assert ["/tf_static", TF, "1", "base:lidar"] in rows
-    code, out, err = run(tmp_path / "drive", tmp_path / "tf", "--list", "--json")
+    code, out, err = run(
+        tmp_path / "drive", tmp_path / "tf", "--list", "--json"
+    )
     document = json.loads(out)
     assert (code, err, document["warnings"]) == (0, "", [])
     assert document["duration_s"] == pytest.approx(9.9)

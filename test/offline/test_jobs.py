@@ -20,7 +20,9 @@ def as_json(run, *arguments):
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    result = hec.calibrate("sample:lidar.tum", "sample:camera.tum", checks=False)
+    result = hec.calibrate(
+        "sample:lidar.tum", "sample:camera.tum", checks=False
+    )
     return result.save(tmp_path_factory.mktemp("saved"))
 
 
@@ -35,12 +37,16 @@ def test_arm_is_calibrate_for_samples(run):
 def test_arm_takes_two_files_as_stops(run, tmp_path):
     files = []
     for name, step in (("lidar.tum", 20), ("camera.tum", 40)):
-        lines = local_path(f"sample:{name}").read_text().splitlines(keepends=True)
+        lines = (
+            local_path(f"sample:{name}").read_text().splitlines(keepends=True)
+        )
         poses = [line for line in lines if not line.startswith("#")]
         files.append(tmp_path / name)
         files[-1].write_text("".join(poses[::step]))
     alone = as_json(run, "arm", *files, "--pair-by", "row")
-    both = as_json(run, "calibrate", *files, "--order", "none", "--pair-by", "row")
+    both = as_json(
+        run, "calibrate", *files, "--order", "none", "--pair-by", "row"
+    )
     assert (alone["reference"], both["reference"]) == ("stops", "stops")
     # Only `arm` counts errors of the tilt of a flat target, so the results differ a little.
     rotation_of = [
@@ -58,7 +64,9 @@ def test_files_of_an_arm_that_fit_two_places_of_the_camera_need_an_option(
 ):
     samples = hec.read_arm_samples("sample:arm.yaml")
     files = [tmp_path / "hand.tum", tmp_path / "target.tum"]
-    for file, poses in zip(files, (samples.robot, samples.tracking), strict=True):
+    for file, poses in zip(
+        files, (samples.robot, samples.tracking), strict=True
+    ):
         stamps_ns = 1_000_000_000 * np.arange(len(poses))
         hec.write_trajectory(file, hec.Trajectory(stamps_ns, np.asarray(poses)))
     document = as_json(run, "arm", *files)
@@ -75,7 +83,9 @@ def test_rig_is_calibrate_for_three_files(run, tmp_path):
     shutil.copy(local_path("sample:camera.tum"), rear)
     code, out, _ = run("rig", "sample:lidar.tum", "sample:camera.tum", rear)
     assert ": 3 sensors\n" in out
-    assert run("calibrate", "sample:lidar.tum", "sample:camera.tum", rear)[:2] == (
+    assert run("calibrate", "sample:lidar.tum", "sample:camera.tum", rear)[
+        :2
+    ] == (
         code,
         out,
     )
@@ -85,7 +95,12 @@ def test_batch_is_calibrate_batch(run, tmp_path):
     folder = tmp_path / "fleet"
     folder.mkdir()
     shutil.copy(local_path("sample:drive.mcap"), folder / "monday.mcap")
-    topics = ("--parent-topic", "/lidar/odometry", "--child-topic", "/camera/odometry")
+    topics = (
+        "--parent-topic",
+        "/lidar/odometry",
+        "--child-topic",
+        "/camera/odometry",
+    )
     rest = (*topics, "--no-report", "--jobs", "1")
     code, out, _ = run("batch", folder, *rest)
     assert code == 0
@@ -102,9 +117,14 @@ def test_export_is_info_as_format(run, saved, name):
 
 @pytest.mark.parametrize(
     ("name", "file"),
-    [("urdf", "extrinsic.urdf.xacro"), ("launch", "static_transform.launch.py")],
+    [
+        ("urdf", "extrinsic.urdf.xacro"),
+        ("launch", "static_transform.launch.py"),
+    ],
 )
-def test_files_of_a_robot_are_exported_as_they_are_saved(run, saved, name, file):
+def test_files_of_a_robot_are_exported_as_they_are_saved(
+    run, saved, name, file
+):
     assert run("export", saved, name)[1] == (saved.parent / file).read_text()
 
 
@@ -116,12 +136,20 @@ def test_files_of_a_robot_are_exported_as_they_are_saved(run, saved, name, file)
             "arm needs the samples of an arm, or the stops of its hand and camera",
         ),
         (["rig", "a.tum", "b.tum"], "rig needs 3 sensors or more, got 2"),
-        (["rig", "bag", "--topics", "/a", "/b"], "rig needs 3 sensors or more, got 2"),
+        (
+            ["rig", "bag", "--topics", "/a", "/b"],
+            "rig needs 3 sensors or more, got 2",
+        ),
         (["batch"], "batch needs bags, folders or patterns of bags"),
-        (["export", "result", "kalbr"], "argument FORMAT: invalid choice: 'kalbr'"),
+        (
+            ["export", "result", "kalbr"],
+            "argument FORMAT: invalid choice: 'kalbr'",
+        ),
     ],
 )
-def test_paths_that_are_not_those_of_the_job_are_refused(run, arguments, message):
+def test_paths_that_are_not_those_of_the_job_are_refused(
+    run, arguments, message
+):
     code, out, err = run(*arguments)
     assert (code, out) == (2, "")
     assert message in err

@@ -54,12 +54,20 @@ def test_sigmas_are_the_spread_of_the_numbers_in_both_directions(rotation):
     T = transform(rotation, (3.0, -2.0, 1.0))
     covariance = covariance_about_parent(rotation, (0.57, 0.028, 0.2))
     assert np.isfinite(sigmas_rpy(T, covariance)).all()
-    xi = np.random.default_rng(3).multivariate_normal(np.zeros(6), covariance, SAMPLES)
+    xi = np.random.default_rng(3).multivariate_normal(
+        np.zeros(6), covariance, SAMPLES
+    )
     drawn = T @ se3.exp(xi)
-    inverse = se3.inverse(T), se3.inverse(drawn), inverse_covariance(T, covariance)
+    inverse = (
+        se3.inverse(T),
+        se3.inverse(drawn),
+        inverse_covariance(T, covariance),
+    )
     for of, samples, stated in ((T, drawn, covariance), inverse):
         along = samples[:, :3, 3].std(axis=0)
-        assert_allclose(sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03)
+        assert_allclose(
+            sigmas_in_parent(of[:3, :3], stated)[:3], along, rtol=0.03
+        )
         sigmas = sigmas_rpy(of, stated)
         if np.isfinite(sigmas).all():  # the inverse of one is locked
             off = se3.rotation_to_rpy(samples[:, :3, :3]) - se3.rotation_to_rpy(
@@ -78,7 +86,11 @@ def test_near_gimbal_lock_roll_and_yaw_are_printed_without_a_sigma():
     assert pitch < np.radians(0.4)
     result = calibration(rotation, (0.3, 0.2, 0.1))
     document = result.to_dict()["T_parent_child"]
-    assert document["sigma_rpy_deg"][0] is document["sigma_measured_rpy_deg"][2] is None
+    assert (
+        document["sigma_rpy_deg"][0]
+        is document["sigma_measured_rpy_deg"][2]
+        is None
+    )
     assert (
         printed_numbers(transforms_of(result)["T_parent_child"], ())["roll"]
         == "20.00 deg"
@@ -120,7 +132,10 @@ def test_with_an_unknown_yaw_the_sigmas_about_the_other_axes_are_printed():
         observability_measured=dofs(sigmas, ["yaw"]),
     )
     text = " ".join(" ".join(as_lines(result)).split())
-    assert "about the axes x and y the rotation is good to 0.9 deg and 0.5 deg" in text
+    assert (
+        "about the axes x and y the rotation is good to 0.9 deg and 0.5 deg"
+        in text
+    )
 
 
 def test_a_result_has_the_sigmas_of_its_printed_numbers_in_both_directions():
@@ -167,16 +182,24 @@ def test_one_sigma_is_stated_on_the_terminal_in_python_and_in_documents():
     assert result.allowance[0] == pytest.approx(allowance_m)
     assert "x 0.3000 +/- 0.0091 m" in repr(result)
     lines = as_lines(result)
-    assert "  x        0.3000 +/- 0.0091 m  (4.3 mm measured, 8 mm allowance)" in lines
-    assert any(
-        "the allowance is for constant odometry errors" in line for line in lines
+    assert (
+        "  x        0.3000 +/- 0.0091 m  (4.3 mm measured, 8 mm allowance)"
+        in lines
     )
-    assert any("--parent-kind exact or --child-kind exact" in line for line in lines)
+    assert any(
+        "the allowance is for constant odometry errors" in line
+        for line in lines
+    )
+    assert any(
+        "--parent-kind exact or --child-kind exact" in line for line in lines
+    )
 
 
 def test_the_axis_of_a_sigma_with_only_a_measured_part_has_no_parts_printed():
     result = calibration(np.eye(3), (0.1, 0.1, 0.1))
-    assert not any("allowance" in line for line in as_lines(result, with_details=True))
+    assert not any(
+        "allowance" in line for line in as_lines(result, with_details=True)
+    )
 
 
 def test_an_axis_with_a_negligible_allowance_has_no_parts_printed():

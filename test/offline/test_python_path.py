@@ -83,7 +83,15 @@ def test_workers_of_a_batch_run_no_file_of_the_current_folder(
     hostile_folder, bags, program
 ):
     out = hostile_folder.parent / "out"
-    batch = ["calibrate", "--batch", *map(str, bags), "--jobs", "2", "--out", str(out)]
+    batch = [
+        "calibrate",
+        "--batch",
+        *map(str, bags),
+        "--jobs",
+        "2",
+        "--out",
+        str(out),
+    ]
     done = run([program, *batch], hostile_folder)
     assert not (hostile_folder / "executed").exists(), done.stderr
     assert len((out / "rows.csv").read_text().splitlines()) == 3
@@ -106,7 +114,9 @@ def test_python_m_runs_no_file_of_the_current_folder_once_the_package_runs(
     for name in STRANGERS:
         if name != "numpy.py":
             (hostile_folder / name).unlink()
-    done = run(["-m", "hand_eye_calib", "calibrate", str(bags[0])], hostile_folder)
+    done = run(
+        ["-m", "hand_eye_calib", "calibrate", str(bags[0])], hostile_folder
+    )
     assert done.returncode in (0, 3), done.stderr
     assert not (hostile_folder / "executed").exists()
 

@@ -25,7 +25,11 @@ from hand_eye_calib.core.base.text import amount, change, with_sigma
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import Extrinsic
-from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
+from hand_eye_calib.core.results.calibration import (
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
 from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.extras.simulation.demo import DRIVE
 from hand_eye_calib.extras.simulation.drive import simulate_drive
@@ -79,7 +83,9 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.elements if name == tag]
 
 
-def simulated(seed=3, poses=200, frames=("lidar", "camera"), options=None, **motion):
+def simulated(
+    seed=3, poses=200, frames=("lidar", "camera"), options=None, **motion
+):
     """Snapshot and calibration of a simulated drive."""
     names = dict(zip(("parent_frame", "child_frame"), frames, strict=True))
     config = dataclasses.replace(DRIVE, poses=poses, **motion, **names)
@@ -129,20 +135,34 @@ def test_page_is_whole_and_stands_alone(drive, request):
 
 def test_every_section_and_figure_is_there_verdict_first(hilly):
     _, _, text, page = hilly
-    sections = [attributes["aria-labelledby"] for attributes in page.all("section")]
-    assert sections == ["verdict", "extrinsic", "uncertainty", "evidence", "data"]
+    sections = [
+        attributes["aria-labelledby"] for attributes in page.all("section")
+    ]
+    assert sections == [
+        "verdict",
+        "extrinsic",
+        "uncertainty",
+        "evidence",
+        "data",
+    ]
     figures = [attributes["id"] for attributes in page.all("figure")]
     assert figures == [f"figure-{name}" for name in FIGURES]
     assert len(page.all("svg")) == len(FIGURES)
     scrolled = [
-        division for division in page.all("div") if division.get("class") == "scroll"
+        division
+        for division in page.all("div")
+        if division.get("class") == "scroll"
     ]
     described = [
-        division["aria-label"] for division in scrolled if division.get("role") == "img"
+        division["aria-label"]
+        for division in scrolled
+        if division.get("role") == "img"
     ]
     assert len(described) == len(FIGURES)
     assert all(re.search(r"\d", label) for label in described)
-    assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][:2] == [
+    assert [tag for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)][
+        :2
+    ] == [
         "h1",
         "h2",
     ]
@@ -162,7 +182,10 @@ def test_numbers_are_the_calibrations(drive, request):
         for value, sigma, decimals in zip(
             values, sigmas, (3, 3, 3, 2, 2, 2), strict=True
         ):
-            assert with_sigma(value, sigma, decimals).replace("+/-", "±") in page.text
+            assert (
+                with_sigma(value, sigma, decimals).replace("+/-", "±")
+                in page.text
+            )
     totals = calibration.sigmas.tolist()
     for dof, total in zip(calibration.observability, totals, strict=True):
         if dof.verdict is DofVerdict.UNOBSERVABLE:
@@ -173,16 +196,27 @@ def test_numbers_are_the_calibrations(drive, request):
             for a in page.all("div")
             if a.get("aria-label", "").startswith(f"{dof.name}: ")
         )
-        match = re.fullmatch(rf"{dof.name}: ([\d.]+) (mm|cm|m|deg), (\w+)", label)
+        match = re.fullmatch(
+            rf"{dof.name}: ([\d.]+) (mm|cm|m|deg), (\w+)", label
+        )
         number, unit, verdict = match.groups()
         assert float(number) == pytest.approx(per_unit[unit] * total, rel=0.06)
         assert verdict == dof.verdict.value
     assert calibration.static_transform_command() in page.text
-    assert f"{calibration.n_inliers} of {calibration.n_pairs} are inliers" in page.text
+    assert (
+        f"{calibration.n_inliers} of {calibration.n_pairs} are inliers"
+        in page.text
+    )
     for warning in calibration.warnings:
         assert " ".join(warning.split()) in page.text
-    assert "Pose of camera in lidar Maps coordinates of camera into lidar." in page.text
-    assert "Pose of lidar in camera Maps coordinates of lidar into camera." in page.text
+    assert (
+        "Pose of camera in lidar Maps coordinates of camera into lidar."
+        in page.text
+    )
+    assert (
+        "Pose of lidar in camera Maps coordinates of lidar into camera."
+        in page.text
+    )
 
 
 def test_what_is_unobservable_is_said_first_with_what_to_do(planar):
@@ -220,7 +254,9 @@ def partial():
 
 
 @pytest.mark.parametrize("name", ["positions", "rates"])
-def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, name):
+def test_results_of_positions_and_rates_have_a_page_of_what_they_show(
+    partial, name
+):
     _calibration, _text, page = partial[name]
     shown = [*FIGURES]
     if name == "rates":
@@ -233,7 +269,9 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
     ]
     assert len(page.all("svg")) == len(shown)
     word, unknown = (
-        ("Orientation", "x, y and z") if name == "rates" else ("Position", "roll")
+        ("Orientation", "x, y and z")
+        if name == "rates"
+        else ("Position", "roll")
     )
     assert f"{word} of antenna in lidar" in page.text
     assert f"{word} of lidar in antenna" in page.text
@@ -244,9 +282,14 @@ def test_results_of_positions_and_rates_have_a_page_of_what_they_show(partial, n
     assert "nan" not in page.text.lower().replace("provenance", "")
 
 
-def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(partial):
+def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(
+    partial,
+):
     calibration, _, page = partial["positions"]
-    assert "Along the axes of antenna: positions have none of their own." in page.text
+    assert (
+        "Along the axes of antenna: positions have none of their own."
+        in page.text
+    )
     lever_arm = calibration.to_dict()["T_child_parent"]
     sigmas = lever_arm["sigma_translation"]
     for value, sigma in zip(lever_arm["translation"], sigmas, strict=True):
@@ -257,17 +300,25 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(pa
     match = re.search(r"within ([\d.]+) (c?m) of each other", page.text)
     assert float(match[1]) * {"cm": 0.01, "m": 1.0}[match[2]] < 0.5
     pattern = r"less than ([\d.]+) (c?m) with the result, and by less than ([\d.]+) (c?m) without"
-    after, unit_after, before, unit_before = re.search(pattern, page.text).groups()
+    after, unit_after, before, unit_before = re.search(
+        pattern, page.text
+    ).groups()
     metres = {"cm": 0.01, "m": 1.0}
-    assert float(after) * metres[unit_after] < float(before) * metres[unit_before]
+    assert (
+        float(after) * metres[unit_after] < float(before) * metres[unit_before]
+    )
 
 
 def test_hostile_names_stay_text():
     hostile = ('<script>alert("x")</script>', "_a$b$ & 'c' id=\"y\" --> ünï 雷")
     snapshot, calibration = simulated(poses=60, frames=hostile)
-    finding = written_finding("x", Severity.NOTE, "<img src=x>", "</li>", stream="<em>")
+    finding = written_finding(
+        "x", Severity.NOTE, "<img src=x>", "</li>", stream="<em>"
+    )
     calibration = dataclasses.replace(calibration, findings=(finding,))
-    _, page = page_of(snapshot, calibration, inputs={"parent": {"topic": "<em>"}})
+    _, page = page_of(
+        snapshot, calibration, inputs={"parent": {"topic": "<em>"}}
+    )
     assert {"script", "img", "em"} & {tag for tag, _ in page.elements} == set()
     for name in (*hostile, "<img src=x>"):
         assert name in page.text
@@ -281,12 +332,18 @@ def test_hostile_names_stay_text():
         ({"poses": 60}, {"method": "park", "reference": "C5"}),
         (
             {"poses": 100, "terrain_height": 0.0},
-            {"prior.z": "0.1+/-0.02", "scale": "estimate", "time_offset": "estimate"},
+            {
+                "prior.z": "0.1+/-0.02",
+                "scale": "estimate",
+                "time_offset": "estimate",
+            },
         ),
     ],
 )
 def test_any_result_gets_a_page(tmp_path, motion, options):
-    snapshot, calibration = simulated(1, **({"poses": 60} | motion), options=options)
+    snapshot, calibration = simulated(
+        1, **({"poses": 60} | motion), options=options
+    )
     write_report(tmp_path, calibration, snapshot, {})
     page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.errors == []
@@ -299,8 +356,12 @@ def test_any_result_gets_a_page(tmp_path, motion, options):
 
 def test_stops_have_a_page(tmp_path):
     poses = wandering_poses(40)
-    stops = hec.calibrate_stops(poses, disturbed(child_of(poses), 1, 1e-3, 1e-3))
-    page = Page(stops.report(tmp_path / "report.html").read_text(encoding="utf-8"))
+    stops = hec.calibrate_stops(
+        poses, disturbed(child_of(poses), 1, 1e-3, 1e-3)
+    )
+    page = Page(
+        stops.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    )
     assert page.errors == []
     names = [a["id"] for a in page.all("figure")]
     assert names == ["figure-views", "figure-stops", "figure-residuals"]
@@ -320,10 +381,14 @@ def calibrate(files, out):
 
 def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     assert calibrate(files, tmp_path / "out") in (0, 3)
-    assert f"wrote {tmp_path / 'out' / 'report.html'}" in capsys.readouterr().err
+    assert (
+        f"wrote {tmp_path / 'out' / 'report.html'}" in capsys.readouterr().err
+    )
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     saved = hec.load(tmp_path / "out")
-    assert (saved.static_transform_command() in page.text) == (saved.status == "ok")
+    assert (saved.static_transform_command() in page.text) == (
+        saved.status == "ok"
+    )
     assert list(saved.cross_check) == [dof.name for dof in saved.observability]
     # Names of the files, not of the folders: the page goes to customers.
     assert all(Path(file).name in page.text for file in files)
@@ -340,7 +405,9 @@ def test_streams_are_shown_on_one_clock_and_in_one_unit():
         < rates_p.max()
     )
     assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
-    holed = evidence.view_streams(drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5)
+    holed = evidence.view_streams(
+        drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5
+    )
     assert [len(spans) for spans in holed.spans_s] == [1, 2]
 
 
@@ -350,22 +417,29 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
 ):
     snapshot, calibration, _, before = planar
     calibration = dataclasses.replace(calibration, target_axes={"x": 0.2})
-    to_parent = se3.from_rotation_translation(np.eye(3), np.array([0.5, 0.0, 0.0]))
-    installed = Extrinsic(to_parent @ calibration.T_parent_child, "robot.urdf <b>")
+    to_parent = se3.from_rotation_translation(
+        np.eye(3), np.array([0.5, 0.0, 0.0])
+    )
+    installed = Extrinsic(
+        to_parent @ calibration.T_parent_child, "robot.urdf <b>"
+    )
     compared = with_comparison(calibration, installed)
     _text, page = page_of(snapshot, compared)
     assert "installed" in [
         attributes["aria-labelledby"] for attributes in page.all("section")
     ]
     shown = page.text[
-        page.text.index("axis of lidar difference") : page.text.rindex("Evidence")
+        page.text.index("axis of lidar difference") : page.text.rindex(
+            "Evidence"
+        )
     ]
     (difference,) = hec.compare([calibration], installed).differences
     assert compared.comparison.sentence in page.text
     along_x = difference.axes["x"]
     visible = amount("x", along_x.visible)
     assert (
-        f"along x {change('x', -0.5, along_x.sigma)} {visible} moved along y" in shown
+        f"along x {change('x', -0.5, along_x.sigma)} {visible} moved along y"
+        in shown
     )
     assert "along z unknown unknown cannot tell about x" in shown
     assert shown.count("deg same") == 3
@@ -373,14 +447,22 @@ def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own
     assert "mark: the target, 2 cm and 0.3 deg" in before.text
     assert "mark: the target, 2 cm, 0.3 deg and x 20 cm" in page.text
     # Each axis has a bar of the standard deviation and one of its measured part, but z is unknown.
-    widths = [[a["style"] for a in report.all("i")] for report in (before, page)]
-    assert [a == b for a, b in zip(*widths, strict=True)] == [False] * 2 + [True] * 9
+    widths = [
+        [a["style"] for a in report.all("i")] for report in (before, page)
+    ]
+    assert [a == b for a, b in zip(*widths, strict=True)] == [False] * 2 + [
+        True
+    ] * 9
     hec.save(compared, tmp_path)
     (file,) = tmp_path.glob("*.yaml")
     stated = yaml.safe_load(file.read_text())["comparison"]
     assert stated["installed"] == "robot.urdf <b>"
-    assert stated["values"]["x"] == pytest.approx(installed.T_parent_child[0, 3])
-    assert stated["differences"][0]["axes"]["x"]["difference"] == pytest.approx(-0.5)
+    assert stated["values"]["x"] == pytest.approx(
+        installed.T_parent_child[0, 3]
+    )
+    assert stated["differences"][0]["axes"]["x"]["difference"] == pytest.approx(
+        -0.5
+    )
     assert stated["differences"][0]["axes"]["z"]["sigma"] is None
 
 
@@ -413,7 +495,10 @@ def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
     nameless = dataclasses.replace(
         calibration, parent_frame="parent_sensor", child_frame="child_sensor"
     )
-    inputs = {"parent": {"file": "/a/roof.tum"}, "child": {"topic": "/camera/odometry"}}
+    inputs = {
+        "parent": {"file": "/a/roof.tum"},
+        "child": {"topic": "/camera/odometry"},
+    }
     _, page = page_of(
         snapshot, nameless, inputs=inputs | {"labels": {"vehicle": "7 <b>"}}
     )
@@ -421,7 +506,8 @@ def test_labels_names_of_files_and_what_it_means_at_a_distance(hilly):
     assert "Maps coordinates of camera/odometry into roof." in page.text
     assert "vehicle: 7 <b>" in page.text[: page.text.index("Verdict")]
     match = re.search(
-        r"10 m from camera/odometry has a standard deviation of ([\d.]+) cm", page.text
+        r"10 m from camera/odometry has a standard deviation of ([\d.]+) cm",
+        page.text,
     )
     J = np.hstack([np.eye(3), -se3.skew(np.array([10.0, 0.0, 0.0]))])
     covariance = J @ calibration.covariance @ J.T
@@ -541,7 +627,8 @@ def test_a_notebook_gets_the_numbers_of_a_result_with_an_unknown_axis(unknown):
     sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
     covariance = np.diag(sigmas**2)
     result = calibration(
-        covariance_measured=covariance, observability_measured=dofs(sigmas, unknown)
+        covariance_measured=covariance,
+        observability_measured=dofs(sigmas, unknown),
     )
     html = result._repr_html_()
     assert result.headline in html
@@ -578,6 +665,8 @@ def test_a_report_is_printed_on_two_pages_and_with_its_details_if_they_are_open(
         result = hec.calibrate_arm(samples.robot, samples.tracking)
     page = result.report(tmp_path / "report.html")
     assert browser.printed_pages(page, tmp_path) == 2
-    opened = page.read_text(encoding="utf-8").replace("<details>", "<details open>")
+    opened = page.read_text(encoding="utf-8").replace(
+        "<details>", "<details open>"
+    )
     page.write_text(opened, encoding="utf-8")
     assert browser.printed_pages(page, tmp_path) > 2

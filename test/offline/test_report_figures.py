@@ -21,9 +21,13 @@ from hand_eye_calib.offline.report.style import LOOK
 def points_of(svg):
     """Points of the lines and of the dots of a figure, by the variables of their colours."""
     points = {}
-    for path, style in re.findall(r'<path d="([^"]*)"[^>]*style="([^"]*)"', svg):
+    for path, style in re.findall(
+        r'<path d="([^"]*)"[^>]*style="([^"]*)"', svg
+    ):
         colour = re.search(r"stroke: var\(--(\w+)\)", style)
-        found = np.array(re.findall(r"[ML] ([\d.-]+) ([\d.-]+)", path), dtype=float)
+        found = np.array(
+            re.findall(r"[ML] ([\d.-]+) ([\d.-]+)", path), dtype=float
+        )
         # Axes and ticks are shorter.
         if colour and len(found) > 20:
             points.setdefault(colour[1], []).append(found)
@@ -40,7 +44,9 @@ def test_the_track_goes_through_the_dots_only_with_the_lever_arm():
     snapshot = whole_snapshot(drive.parent, child, frames)
     calibration = snapshot.estimate()
     gathered = evidence.gather(calibration, snapshot)
-    drawn = {figure.name: figure for figure in figures_of(calibration, gathered)}
+    drawn = {
+        figure.name: figure for figure in figures_of(calibration, gathered)
+    }
     assert [name for _, name in drawn["track"].key] == [
         "lidar, no lever arm",
         "lidar, through the result",
@@ -55,7 +61,9 @@ def test_the_track_goes_through_the_dots_only_with_the_lever_arm():
         # The path is simplified: points between its corners are on it, too.
         along = np.linspace(0, len(path) - 1, 2000)
         rows = np.arange(len(path))
-        dense = np.column_stack([np.interp(along, rows, axis) for axis in path.T])
+        dense = np.column_stack(
+            [np.interp(along, rows, axis) for axis in path.T]
+        )
         distances = np.linalg.norm(dots[:, None] - dense, axis=2).min(axis=1)
         medians[colour] = np.median(distances)
     assert medians["parent"] < 0.5 * medians["muted"]
@@ -66,9 +74,13 @@ def test_the_turning_part_of_a_path_is_its_turn():
     # Straight ahead at 1 m/s, but a circle of 2 m from 40 s on, for 12.6 s.
     rates = np.where((times_s > 40.0) & (times_s < 52.6), 0.5, 0.0)
     headings = np.cumsum(rates) * 0.1
-    steps = 0.1 * np.column_stack([np.cos(headings), np.sin(headings), 0 * headings])
+    steps = 0.1 * np.column_stack(
+        [np.cos(headings), np.sin(headings), 0 * headings]
+    )
     part = evidence.turning_part(np.cumsum(steps, axis=0), times_s, 10.0)
     assert times_s[part.start] > 39.0
     assert times_s[part.stop - 1] < 54.0
-    short = evidence.turning_part(np.cumsum(steps[:50], axis=0), times_s[:50], 10.0)
+    short = evidence.turning_part(
+        np.cumsum(steps[:50], axis=0), times_s[:50], 10.0
+    )
     assert short == slice(0, 50)

@@ -13,7 +13,16 @@ from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.offline.cli.main import main
 
 # Each takes from a tenth of a second to a second to load.
-HEAVY = {"casadi", "matplotlib", "numpy", "rclpy", "rich", "rosbags", "scipy", "yaml"}
+HEAVY = {
+    "casadi",
+    "matplotlib",
+    "numpy",
+    "rclpy",
+    "rich",
+    "rosbags",
+    "scipy",
+    "yaml",
+}
 
 SHOW_HELP = """
 import sys
@@ -51,8 +60,12 @@ def test_the_help_of_every_command_loads_no_library():
     ],
 )
 def test_engine_and_node_load_only_what_they_compute_with(code):
-    loaded = loaded_by(f"{code}; import sys; print(*sys.modules, file=sys.stderr)")
-    allowed = {"numpy", "scipy"} | ({"rclpy", "yaml"} if ".ros." in code else set())
+    loaded = loaded_by(
+        f"{code}; import sys; print(*sys.modules, file=sys.stderr)"
+    )
+    allowed = {"numpy", "scipy"} | (
+        {"rclpy", "yaml"} if ".ros." in code else set()
+    )
     assert not {name.partition(".")[0] for name in loaded} & (HEAVY - allowed)
     # Any part of scipy takes as long as all the rest, but for the wrapper of LAPACK alone.
     assert {name for name in loaded if name.startswith("scipy")} <= {

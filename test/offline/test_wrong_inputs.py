@@ -189,7 +189,8 @@ TABLE = """
 2 | arm lidar.tum image.png | is an image: pass the folder of images, --target and --camera
 """
 ROWS = [
-    [cell.strip() for cell in row.split(" | ")] for row in TABLE.strip().splitlines()
+    [cell.strip() for cell in row.split(" | ")]
+    for row in TABLE.strip().splitlines()
 ]
 
 TEXTS = {
@@ -235,10 +236,13 @@ def inputs(tmp_path_factory):
         (folder / name).write_text(text)
     (folder / "binary.tum").write_bytes(bytes(range(256)) * 10)
     (folder / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    (folder / "cut.mcap").write_bytes((folder / "drive.mcap").read_bytes()[:3000])
+    (folder / "cut.mcap").write_bytes(
+        (folder / "drive.mcap").read_bytes()[:3000]
+    )
     (folder / "packed.gz").write_bytes(gzip.compress(b"0 0 0 0 0 0 0 1\n"))
     lidar, camera = (
-        hec.read_trajectory(f"sample:{name}.tum") for name in ("lidar", "camera")
+        hec.read_trajectory(f"sample:{name}.tum")
+        for name in ("lidar", "camera")
     )
     hec.save(hec.calibrate(lidar, camera), folder / "saved")
     write_poses(folder)
@@ -286,7 +290,9 @@ def write_angles(path, rows, angles):
     """Write the stamps and positions of rows with angles in columns named as radians."""
     header = "t,x,y,z,roll_rad,pitch_rad,yaw_rad"
     table = np.c_[rows[:, :4], angles]
-    np.savetxt(path, table, fmt="%.9f", delimiter=",", header=header, comments="")
+    np.savetxt(
+        path, table, fmt="%.9f", delimiter=",", header=header, comments=""
+    )
 
 
 @pytest.mark.parametrize(
@@ -320,7 +326,9 @@ def test_an_option_of_dnlo_has_a_note_with_another_method(run):
         "Note: the option threshold has no effect with method adaptive: only dnlo uses"
         in words
     )
-    _, out, _ = run("calibrate", *paths, "--threshold", "0.5", "--method", "dnlo")
+    _, out, _ = run(
+        "calibrate", *paths, "--threshold", "0.5", "--method", "dnlo"
+    )
     assert "has no effect" not in out
 
 
@@ -329,7 +337,9 @@ def test_a_yaw_that_counts_turns_is_read_in_radians_with_a_note(tmp_path):
     angles = np.zeros((len(rows), 3))
     angles[:, 2] = np.linspace(0.0, 40.0, len(rows))
     write_angles(tmp_path / "turns.csv", rows, angles)
-    with pytest.warns(UserWarning, match="yaw_rad reaches 40 rad, more than one turn"):
+    with pytest.warns(
+        UserWarning, match="yaw_rad reaches 40 rad, more than one turn"
+    ):
         trajectory = hec.read_trajectory(tmp_path / "turns.csv", "auto")
     rotation = Rotation.from_matrix(trajectory.poses[-1, :3, :3])
     assert_allclose(np.sin(rotation.magnitude()), abs(np.sin(40.0)))
@@ -429,19 +439,26 @@ def test_a_result_with_exchanged_frames_is_compared_as_its_inverse():
 def test_the_name_of_a_frame_with_a_space_gets_a_note(run):
     paths = ("sample:lidar.tum", "sample:camera.tum")
     code, _, err = run("calibrate", *paths, "--parent-frame", "base link")
-    assert (code, "'base link' contains a space; 'base_link' may" in err) == (0, True)
+    assert (code, "'base link' contains a space; 'base_link' may" in err) == (
+        0,
+        True,
+    )
 
 
 def test_a_note_on_a_unit_names_the_other_unit_which_is_obeyed(tmp_path):
     rows = np.loadtxt(local_path("sample:lidar.tum"))[:, :3] * [1.0, 1e-5, 1e-5]
     path = tmp_path / "fixes.csv"
-    np.savetxt(path, rows, "%.9f", ",", header="t,latitude,longitude", comments="")
+    np.savetxt(
+        path, rows, "%.9f", ",", header="t,latitude,longitude", comments=""
+    )
     with pytest.warns(UserWarning, match="read in rad, .* such as lon_deg"):
         in_rad = hec.read_trajectory(path, "auto")
     np.savetxt(path, rows, "%.9f", ",", header="t,lat_deg,lon_deg", comments="")
     with pytest.warns(UserWarning, match="positions only"):
         in_deg = hec.read_trajectory(path, "auto")
-    lengths = [np.ptp(positions.poses[:, 0, 3]) for positions in (in_rad, in_deg)]
+    lengths = [
+        np.ptp(positions.poses[:, 0, 3]) for positions in (in_rad, in_deg)
+    ]
     assert_allclose(lengths[0] / lengths[1], np.degrees(1.0), rtol=1e-3)
 
 
@@ -454,9 +471,16 @@ def test_a_file_of_another_name_is_not_proposed(run, inputs, monkeypatch, name):
     assert "did you mean" not in err
 
 
-def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatch):
+def test_a_topic_that_another_sensor_has_is_not_proposed(
+    run, inputs, monkeypatch
+):
     monkeypatch.chdir(inputs)
-    topics = ["--parent-topic", "/lidr/odometry", "--child-topic", "/lidar/odometry"]
+    topics = [
+        "--parent-topic",
+        "/lidr/odometry",
+        "--child-topic",
+        "/lidar/odometry",
+    ]
     _, _, err = run("calibrate", "drive.mcap", *topics)
     assert "no topic /lidr/odometry in drive.mcap" in err
     assert "did you mean /lidar/odometry" not in err
@@ -464,15 +488,24 @@ def test_a_topic_that_another_sensor_has_is_not_proposed(run, inputs, monkeypatc
 
 def test_an_option_of_the_second_file_is_named_and_obeyed(run, tmp_path):
     stops = SAMPLES.robot
-    degrees = Rotation.from_matrix(stops[:, :3, :3]).as_euler("ZYX", degrees=True)
+    degrees = Rotation.from_matrix(stops[:, :3, :3]).as_euler(
+        "ZYX", degrees=True
+    )
     np.savetxt(tmp_path / "hand.txt", np.c_[stops[:, :3, 3], degrees])
-    child = Rotation.from_matrix(np.linalg.inv(SAMPLES.tracking)[:, :3, :3]).as_quat()
+    child = Rotation.from_matrix(
+        np.linalg.inv(SAMPLES.tracking)[:, :3, :3]
+    ).as_quat()
     rows = np.c_[np.linalg.inv(SAMPLES.tracking)[:, :3, 3], child]
     header = "x,y,z,qx,qy,qz,qw"
-    np.savetxt(tmp_path / "camera.csv", rows, delimiter=",", header=header, comments="")
+    np.savetxt(
+        tmp_path / "camera.csv", rows, delimiter=",", header=header, comments=""
+    )
     paths = [str(tmp_path / name) for name in ("hand.txt", "camera.csv")]
     _, _, err = run("arm", *paths, "--parent-angles", "kuka")
-    assert "camera.csv is read as format csv; to change this, set --child-format" in err
+    assert (
+        "camera.csv is read as format csv; to change this, set --child-format"
+        in err
+    )
     columns = ["--child-columns", "x,y,z,qx,qy,qz,q"]
     code, _, err = run("arm", *paths, "--parent-angles", "kuka", *columns)
     assert (code, "no column for qw" in err) == (1, True)
@@ -481,15 +514,23 @@ def test_an_option_of_the_second_file_is_named_and_obeyed(run, tmp_path):
 def test_a_pattern_that_fits_no_recording_is_named(run, inputs, monkeypatch):
     monkeypatch.chdir(inputs)
     shutil.copy("drive.mcap", "drive2.mcap")
-    _, _, err = run("batch", "drive.mcap", "drive2.mcap", "--vehicle", "{vehicle}/*/x")
-    assert "--vehicle '{vehicle}/*/x' fits none of their paths; set it to" in err
+    _, _, err = run(
+        "batch", "drive.mcap", "drive2.mcap", "--vehicle", "{vehicle}/*/x"
+    )
+    assert (
+        "--vehicle '{vehicle}/*/x' fits none of their paths; set it to" in err
+    )
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_sensor_that_never_moves_is_named_without_warnings_of_numpy(run, tmp_path):
+def test_a_sensor_that_never_moves_is_named_without_warnings_of_numpy(
+    run, tmp_path
+):
     rows = np.loadtxt(local_path("sample:camera.tum"))
     rows[:, 1:] = rows[0, 1:]
     np.savetxt(tmp_path / "still.tum", rows, fmt="%.9f")
-    code, out, _ = run("calibrate", "sample:lidar.tum", str(tmp_path / "still.tum"))
+    code, out, _ = run(
+        "calibrate", "sample:lidar.tum", str(tmp_path / "still.tum")
+    )
     assert code == 3
     assert "the child stream repeats the same pose" in out

@@ -37,7 +37,8 @@ TARGETS = (0.02,) * 3 + (0.005,) * 3
 def result(sigmas_m=0.005, **fields):
     sigmas = np.r_[np.broadcast_to(sigmas_m, 3), np.full(3, 0.001)].tolist()
     verdicts = [
-        DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE for s in sigmas
+        DofVerdict.OBSERVED if s < np.inf else DofVerdict.UNOBSERVABLE
+        for s in sigmas
     ]
     dofs = tuple(map(DofObservability, AXES, verdicts, sigmas))
     fields = {
@@ -46,7 +47,9 @@ def result(sigmas_m=0.005, **fields):
         "warnings": (),
         "findings": (),
     } | fields
-    return dataclasses.replace(calibration(), observability_measured=dofs, **fields)
+    return dataclasses.replace(
+        calibration(), observability_measured=dofs, **fields
+    )
 
 
 @pytest.fixture
@@ -58,11 +61,14 @@ def lines():
 def cycle(lines, monkeypatch):
     """A cycle whose process answers nothing."""
     jobs = []
-    nothing = SimpleNamespace(submit=jobs.append, stop=lambda s: None, answers=list)
+    nothing = SimpleNamespace(
+        submit=jobs.append, stop=lambda s: None, answers=list
+    )
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
     levels = ("debug", "info", "warning", "error")
     write = {
-        level: lambda text, level=level: lines.append((level, text)) for level in levels
+        level: lambda text, level=level: lines.append((level, text))
+        for level in levels
     }
     log = NodeLog(SimpleNamespace(**write))
     session = LiveSession(log, CalibratorConfig())
@@ -74,14 +80,18 @@ def cycle(lines, monkeypatch):
     return made
 
 
-def answered(cycle, motion_s, sigmas_m=0.005, n_poses=100, check=None, **fields):
+def answered(
+    cycle, motion_s, sigmas_m=0.005, n_poses=100, check=None, **fields
+):
     newest = result(sigmas_m=sigmas_m, n_poses=n_poses, **fields)
     return cycle.conclude(Answer(0, 0.1, seen(motion_s), newest, check=check))
 
 
 def determined():
     """Motion of 25 s that hides no axis."""
-    return dataclasses.replace(seen(25.0, (40.0, 40.0, 40.0)), lever_arms=np.eye(3))
+    return dataclasses.replace(
+        seen(25.0, (40.0, 40.0, 40.0)), lever_arms=np.eye(3)
+    )
 
 
 def reach_goal(cycle):
@@ -91,11 +101,15 @@ def reach_goal(cycle):
     return good, text
 
 
-def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines):
+def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(
+    cycle, lines
+):
     reach_goal(cycle)
     kept = cycle.result
     moved = result().T_parent_child + np.eye(4, k=3) * 0.1
-    good, text = answered(cycle, 46.0, (0.005, 0.01, 0.005), 120, T_parent_child=moved)
+    good, text = answered(
+        cycle, 46.0, (0.005, 0.01, 0.005), 120, T_parent_child=moved
+    )
     assert good
     assert f"{kept.n_poses} poses, {kept.n_pairs} pairs" in text
     (warning,) = cycle.result.warnings
@@ -105,7 +119,9 @@ def test_what_is_kept_is_answered_and_says_why_it_is_not_the_newest(cycle, lines
     )
     # The log has the values; nobody has to do anything.
     (logged,) = [
-        line for level, line in lines if level == "info" and line.startswith(warning)
+        line
+        for level, line in lines
+        if level == "info" and line.startswith(warning)
     ]
     assert f"{moved[0, 3]:.4f}" in logged
     assert "(5.0, 10.0, 5.0) mm" in logged
@@ -131,7 +147,9 @@ def test_what_somebody_asks_for_is_checked_and_other_solves_are_every_half_minut
     assert [job.check for job in cycle.jobs] == [False, True, False, True]
 
 
-def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypatch):
+def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(
+    cycle, monkeypatch
+):
     answers = []
     start_s = module.time.monotonic()
     cycle.ask(lambda *answer: answers.append(answer))
@@ -148,8 +166,12 @@ def test_who_waits_for_long_is_told_once_that_the_solve_goes_on(cycle, monkeypat
 
 def test_the_rotation_that_was_seen_does_not_fall_while_driving(cycle):
     for degrees in (179.0, 175.0, 174.0):
-        cycle.conclude(Answer(0, 0.1, seen(40.0, (0.0, 9.0, degrees)), result()))
-        rotation_deg = cycle.extrinsic_state(True, (Broadcast.OFF, "")).rotation_deg
+        cycle.conclude(
+            Answer(0, 0.1, seen(40.0, (0.0, 9.0, degrees)), result())
+        )
+        rotation_deg = cycle.extrinsic_state(
+            True, (Broadcast.OFF, "")
+        ).rotation_deg
         assert rotation_deg == pytest.approx({"x": 0.0, "y": 9.0, "z": 179.0})
 
 
@@ -198,7 +220,9 @@ def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
         ),
     ],
 )
-def test_what_a_failed_solve_lacks_is_said_in_short_sentences(cycle, answer, sentence):
+def test_what_a_failed_solve_lacks_is_said_in_short_sentences(
+    cycle, answer, sentence
+):
     cycle.conclude(answer)
     assert cycle.goal.progress.sentence.startswith(sentence)
 
@@ -223,22 +247,31 @@ def test_a_solve_that_fails_says_so_and_changes_nothing(cycle):
     reach_goal(cycle)
     before = cycle.result
     good, text = answered(cycle, 46.0, status=SolveStatus.NOT_CONVERGED)
-    assert (good, text.startswith("DO NOT USE: the solver did not converge")) == (
+    assert (
+        good,
+        text.startswith("DO NOT USE: the solver did not converge"),
+    ) == (
         False,
         True,
     )
     assert cycle.result is before
 
 
-def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(cycle):
+def test_streams_that_turn_out_faulty_end_done_and_the_verdict_says_the_same(
+    cycle,
+):
     reach_goal(cycle)
-    finding = written_finding("inverse", Severity.ERROR, "inverse poses", "invert")
+    finding = written_finding(
+        "inverse", Severity.ERROR, "inverse poses", "invert"
+    )
     result_of_check = CheckResult(findings=(finding,))
     _good, text = answered(cycle, 46.0, check=result_of_check)
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert text.startswith("DO NOT USE: ")
     assert not cycle.goal.progress.done
-    assert cycle.goal.progress.sentence.startswith("Stop: the streams are faulty")
+    assert cycle.goal.progress.sentence.startswith(
+        "Stop: the streams are faulty"
+    )
 
 
 def test_the_log_of_a_good_session_of_seven_minutes_is_short_and_asks_for_nothing(
@@ -258,7 +291,9 @@ def test_the_log_of_a_good_session_of_seven_minutes_is_short_and_asks_for_nothin
     assert cycle.goal.progress.done
     assert {level for level, _ in lines} <= {"info", "debug"}, lines
     shown = [text for level, text in lines if level != "debug"]
-    assert sum(len(text) + 60 for text in shown) < 5000  # 60: what ROS writes before it
+    assert (
+        sum(len(text) + 60 for text in shown) < 5000
+    )  # 60: what ROS writes before it
     assert cycle.goal.progress.sentence.startswith("Done: ")
 
 
@@ -289,16 +324,16 @@ def shape(hint):
     }
     inner = typing.get_args(hint)
     if types.NoneType in inner:
-        return f"{shape(inner[0])}?" if len(inner) == 2 else shape(hint.__origin__)
+        return (
+            f"{shape(inner[0])}?" if len(inner) == 2 else shape(hint.__origin__)
+        )
     if inner and Ellipsis in inner:
         return f"[{shape(inner[0])}, ...]"
     if inner:
         return f"{{KEY: {shape(inner[1])}, ...}}"
     if dataclasses.is_dataclass(hint):
         hints = typing.get_type_hints(hint)
-        return (
-            f"{{{', '.join(f'{name}: {shape(item)}' for name, item in hints.items())}}}"
-        )
+        return f"{{{', '.join(f'{name}: {shape(item)}' for name, item in hints.items())}}}"
     if hint not in words and issubclass(hint, Enum):
         return "/".join(map(plain, hint))
     return words[hint]
@@ -309,7 +344,9 @@ def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
         f"{name}: {shape(item)}"
         for name, item in typing.get_type_hints(NodeState).items()
     ]
-    wrapped = [textwrap.fill(line, 98, subsequent_indent="  ") for line in lines]
+    wrapped = [
+        textwrap.fill(line, 98, subsequent_indent="  ") for line in lines
+    ]
     text = "\n".join(["```text", *wrapped, "```"])
     page = (ROOT / "docs" / "node.md").read_text()
     assert text in page, f"docs/node.md must have this text:\n{text}"
@@ -317,25 +354,35 @@ def test_the_keys_of_the_progress_topic_are_on_the_page_of_the_node():
 
 def scatter(of_halves):
     """A cross-check in which both halves differ about the rotation about x."""
-    row = AxisScatter(sigma=0.001, of_methods=0.0, of_halves=0.0, excess_of_halves=0.0)
+    row = AxisScatter(
+        sigma=0.001, of_methods=0.0, of_halves=0.0, excess_of_halves=0.0
+    )
     apart = dataclasses.replace(
         row, of_halves=of_halves, excess_of_halves=1000.0 * of_halves
     )
     return dict.fromkeys(AXES, row) | {"roll": apart}
 
 
-def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(cycle, lines):
+def test_what_the_halves_of_the_whole_drive_no_longer_say_is_taken_back(
+    cycle, lines
+):
     for motion_s in (20.0, 32.0, 44.0):
         answered(cycle, motion_s, cross_check=scatter(0.7))
     assert [reason.rule for reason in cycle.result.reasons] == ["halves"]
-    sentence = "the two halves of the recording disagree about the rotation about x"
+    sentence = (
+        "the two halves of the recording disagree about the rotation about x"
+    )
     assert "warning" in {level for level, text in lines if sentence in text}
     # The newest result is worse, and the one before is kept.
-    _, text = answered(cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0))
+    _, text = answered(
+        cycle, 60.0, (0.005, 0.01, 0.005), 200, cross_check=scatter(0.0)
+    )
     assert "the result of 100 poses is kept" in text
     assert cycle.result.verdict is Verdict.USE
     taken_back = [
-        (level, text) for level, text in lines if text.startswith("no longer found")
+        (level, text)
+        for level, text in lines
+        if text.startswith("no longer found")
     ]
     assert [level for level, _ in taken_back] == ["info"]
     assert sentence in taken_back[0][1]
@@ -360,9 +407,16 @@ def test_a_solve_on_a_busy_computer_is_named_and_its_pause_is_short(
     assert cycle.extrinsic_state(True, (Broadcast.OFF, "")).slow == ""
 
 
-def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(cycle):
+def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(
+    cycle,
+):
     hurries = [cycle.jobs[-1].has_hurry]
-    for seconds, processor_s in ((60.0, 0.5), (1.0, 0.1), (15.0, 14.0), (15.0, 0.4)):
+    for seconds, processor_s in (
+        (60.0, 0.5),
+        (1.0, 0.1),
+        (15.0, 14.0),
+        (15.0, 0.4),
+    ):
         cycle.conclude(
             Answer(0, seconds, seen(30.0), result(), processor_s=processor_s)
         )
@@ -371,7 +425,9 @@ def test_the_next_solve_has_hurry_if_other_programs_have_held_up_the_last_one(cy
     assert hurries == [False, True, False, False, True]
 
 
-def test_a_running_solve_that_takes_long_is_named_before_it_ends(cycle, monkeypatch):
+def test_a_running_solve_that_takes_long_is_named_before_it_ends(
+    cycle, monkeypatch
+):
     now_s = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now_s[0])
     cycle._start()

@@ -30,7 +30,9 @@ def result(sigmas_m=0.005, sigmas_rad=0.001, verdicts=(), **fields):
     sigmas = np.r_[np.broadcast_to(sigmas_m, 3), np.broadcast_to(sigmas_rad, 3)]
     named = dict(verdicts)
     dofs = tuple(
-        DofObservability(axis, named.get(axis, DofVerdict.OBSERVED), float(sigma))
+        DofObservability(
+            axis, named.get(axis, DofVerdict.OBSERVED), float(sigma)
+        )
         for axis, sigma in zip(AXES, sigmas, strict=True)
     )
     fields = {"status": SolveStatus.OK, "noise": None} | fields
@@ -61,7 +63,8 @@ def test_the_session_ends_once_more_motion_has_confirmed_the_targets():
         0.0,
     )
     assert (
-        within.sentence == "Confirming, 40 s: every axis is within its target. Go on."
+        within.sentence
+        == "Confirming, 40 s: every axis is within its target. Go on."
     )
     assert within.seconds_left == 40.0
     assert goal.add(result(), seen(50.0)).seconds_left == 30.0
@@ -72,7 +75,12 @@ def test_the_session_ends_once_more_motion_has_confirmed_the_targets():
 
 def test_a_result_beyond_its_target_begins_the_confirmation_anew():
     goal = Goal(TARGETS)
-    for motion_s, sigma_m in ((20.0, 0.01), (30.0, 0.03), (40.0, 0.01), (70.0, 0.01)):
+    for motion_s, sigma_m in (
+        (20.0, 0.01),
+        (30.0, 0.03),
+        (40.0, 0.01),
+        (70.0, 0.01),
+    ):
         assert not goal.add(result(sigmas_m=sigma_m), seen(motion_s)).done
     assert goal.add(result(), seen(80.0)).done
 
@@ -102,7 +110,9 @@ def test_the_bar_the_target_and_the_end_have_one_scale():
 
 def test_a_target_below_the_allowance_is_no_fault_of_the_motion():
     allowance = np.diag([0.03**2] * 3 + [1e-8] * 3)
-    progress = Goal(TARGETS).add(result(covariance_allowance=allowance), seen(40.0))
+    progress = Goal(TARGETS).add(
+        result(covariance_allowance=allowance), seen(40.0)
+    )
     assert progress.target_is_too_small
     assert progress.sentence == (
         "No motion makes x good to 2 cm. Constant errors alone may be 3 cm. "
@@ -161,7 +171,9 @@ def test_the_motion_of_the_last_minute_counts_if_it_is_better():
         goal.add(poor, seen(motion_s, FLAT))
     # Half of the information of z within the last 30 s.
     better = result(sigmas_m=(0.004, 0.004, 0.02 * np.sqrt(2.0)))
-    progress = goal.add(better, seen(320.0), newest_motion=seen(60.0, (0.5, 9.0, 90.0)))
+    progress = goal.add(
+        better, seen(320.0), newest_motion=seen(60.0, (0.5, 9.0, 90.0))
+    )
     assert progress.axes["z"].seconds_left == pytest.approx(30.0)
     assert progress.sentence == (
         "Go on for about 2 min, z takes longest. This motion is right, more of it."
@@ -180,7 +192,9 @@ def test_a_motion_that_does_not_observe_an_axis_has_no_time_left():
     hidden = result(sigmas_m=(0.004, 0.004, 0.05))
     flat = Goal(TARGETS).add(hidden, seen(60.0, FLAT))
     assert flat.seconds_left == flat.axes["z"].seconds_left == np.inf
-    assert flat.sentence.startswith("z is not determined well enough yet. Drive ")
+    assert flat.sentence.startswith(
+        "z is not determined well enough yet. Drive "
+    )
     assert not flat.will_not_get_there
     ramps = seen(60.0, (0.5, 9.0, 90.0))
     on_ramps = Goal(TARGETS).add(hidden, seen(60.0, FLAT), newest_motion=ramps)
@@ -189,7 +203,9 @@ def test_a_motion_that_does_not_observe_an_axis_has_no_time_left():
 
 def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():
     goal = Goal(TARGETS)
-    hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
+    hidden = result(
+        sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE
+    )
     assert goal.add(
         hidden, seen(60.0, FLAT), newest_motion=seen(60.0, FLAT)
     ).will_not_get_there
@@ -207,7 +223,9 @@ def test_the_time_left_only_shrinks_by_two_steps_at_a_result():
     for motion_s, sigma_m in enumerate(
         (0.043, 0.0205, 0.04, 0.04, 0.03, 0.004, 0.021, 0.03), 40
     ):
-        progress = goal.add(result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s))
+        progress = goal.add(
+            result(sigmas_m=(0.004, sigma_m, 0.004)), seen(motion_s)
+        )
         times_s.append(seconds_left(progress)[1])
     assert times_s == [180.0, 90.0, 90.0, 90.0, 60.0, 0.0, 15.0, 15.0]
 
@@ -223,7 +241,8 @@ def test_the_time_of_a_confirmation_does_not_follow_a_longer_estimate():
 def test_the_end_of_a_confirmation_is_reported_to_a_few_seconds():
     goal = Goal(TARGETS)
     sentences = [
-        goal.add(result(), seen(motion_s)).sentence for motion_s in (40.0, 73.0, 77.0)
+        goal.add(result(), seen(motion_s)).sentence
+        for motion_s in (40.0, 73.0, 77.0)
     ]
     times = [sentence.partition(":")[0] for sentence in sentences]
     assert times == ["Confirming, 40 s", "Confirming, 8 s", "Confirming, 4 s"]
@@ -240,16 +259,26 @@ def test_a_much_longer_time_left_is_a_new_estimate():
 def test_faults_of_the_streams_and_failed_solves_are_no_success():
     goal = Goal(TARGETS)
     for motion_s in (40.0, 42.0):
-        assert not goal.add(result(), seen(motion_s), ["the clocks differ"]).done
-    assert goal.progress.sentence == "Stop: the streams are faulty: the clocks differ."
+        assert not goal.add(
+            result(), seen(motion_s), ["the clocks differ"]
+        ).done
+    assert (
+        goal.progress.sentence
+        == "Stop: the streams are faulty: the clocks differ."
+    )
     for motion_s in (44.0, 46.0):
         goal.add(result(status=SolveStatus.CONTRADICTED), seen(motion_s))
-    assert goal.progress.sentence == "No usable result: a prior contradicts the motion."
+    assert (
+        goal.progress.sentence
+        == "No usable result: a prior contradicts the motion."
+    )
     assert goal.best is None
 
 
 def test_what_was_measured_by_hand_need_not_be_shown_by_motion():
-    by_hand = result(sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR})
+    by_hand = result(
+        sigmas_m=(0.004, 0.004, 0.05), verdicts={"z": DofVerdict.PRIOR}
+    )
     assert progress_after(Goal(TARGETS), *[by_hand] * 3).done
 
 
@@ -279,7 +308,9 @@ def test_the_newest_of_equally_good_results_is_kept():
 
 
 def test_a_saved_result_tells_how_far_the_session_was(tmp_path):
-    progress = Goal(TARGETS).add(result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0))
+    progress = Goal(TARGETS).add(
+        result(sigmas_m=(0.004, 0.028, np.inf)), seen(40.0)
+    )
     hec.save(made().with_part("goal", progress), tmp_path)
     loaded = hec.load(tmp_path).goal
     assert loaded == progress
@@ -294,7 +325,9 @@ ON_A_FLAT_FLOOR = "Drive over a ramp or a kerb, or measure it by hand"
 
 def test_an_axis_that_stays_unobservable():
     goal = Goal(TARGETS)
-    hidden = result(sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE)
+    hidden = result(
+        sigmas_m=(0.004, 0.004, np.inf), status=SolveStatus.UNOBSERVABLE
+    )
     assert not goal.add(hidden, seen(20.0, FLAT)).will_not_get_there
     stuck = goal.add(hidden, seen(40.0, FLAT))
     assert (stuck.will_not_get_there, stuck.limiting_axis) == (True, "z")
@@ -326,7 +359,9 @@ def test_only_motion_counts_as_time():
     moved = np.clip(s - 10.0, 0.0, 20.0)  # parked, 20 s at 1 m/s, parked
     jitter = np.random.default_rng(0).normal(size=(len(s), 3)) * 0.005
     places = np.stack([moved, 0 * s, 0 * s], axis=1) + jitter
-    poses = se3.from_rotation_translation(np.tile(np.eye(3), (len(s), 1, 1)), places)
+    poses = se3.from_rotation_translation(
+        np.tile(np.eye(3), (len(s), 1, 1)), places
+    )
     pairs = PosePairs((s * 1e9).astype(np.int64), poses, poses)
     assert excitation(pairs).motion_s == pytest.approx(20.0, abs=1.5)
     assert excitation(pairs[:50]).motion_s == 0.0
@@ -334,7 +369,9 @@ def test_only_motion_counts_as_time():
 
 def test_positions_alone_are_done_without_a_word_of_the_rotation():
     hidden = dict.fromkeys(AXES[3:], DofVerdict.UNOBSERVABLE)
-    of_positions = result(sigmas_rad=np.inf, verdicts=hidden, measured="positions")
+    of_positions = result(
+        sigmas_rad=np.inf, verdicts=hidden, measured="positions"
+    )
     progress = progress_after(Goal(TARGETS), *[of_positions] * 3)
     assert progress.done
     assert progress.sentence.startswith("Done: x, y and z are good to 5 mm")

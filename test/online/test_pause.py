@@ -36,7 +36,9 @@ def node(monkeypatch, log_lines):
     monkeypatch.setattr(cycle_module, "SolvingProcess", lambda wake: nothing)
     now = [1000.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    write = dict.fromkeys(("debug", "info", "warning", "error"), log_lines.append)
+    write = dict.fromkeys(
+        ("debug", "info", "warning", "error"), log_lines.append
+    )
     log = NodeLog(SimpleNamespace(**write))
     session = LiveSession(log, CalibratorConfig())
     inputs = [
@@ -54,7 +56,9 @@ def node(monkeypatch, log_lines):
 
 
 def pose_at(stamp_ns):
-    return PoseFields(stamp_ns, "world", None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    return PoseFields(
+        stamp_ns, "world", None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
+    )
 
 
 def run(node, seconds, senders=("parent", "child"), stamps_stand=False):
@@ -70,7 +74,8 @@ def run(node, seconds, senders=("parent", "child"), stamps_stand=False):
 
 def state_of(node, may_rest=False):
     inputs = {
-        source.name: source.state(node.now[0], may_rest) for source in node.inputs
+        source.name: source.state(node.now[0], may_rest)
+        for source in node.inputs
     }
     pause = pause_of(inputs, node.inputs[0].is_enabled)
     return NodeState(
@@ -106,7 +111,10 @@ def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
         Level.OK,
     )
     assert state.inputs["child"].text == "/child_odom has been silent for 7 s"
-    assert (state.progress.level, state.progress.is_paused) == (Level.WARN, True)
+    assert (state.progress.level, state.progress.is_paused) == (
+        Level.WARN,
+        True,
+    )
     assert state.progress.text == (
         "Paused: no pose of child (/child_odom) for 7.0 s; start its source again."
     )
@@ -136,13 +144,18 @@ def test_messages_that_give_no_pose_are_no_sign_of_life(node, stream):
     assert (state.progress.is_paused, view_of(state).word) == (True, "PAUSED")
 
 
-def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(node):
+def test_a_publisher_that_has_gone_is_named_and_a_parked_robot_asks_for_nothing(
+    node,
+):
     run(node, 20.0)
     with_result(node)
     run(node, 8.0, senders=[])
     parked = state_of(node, may_rest=True)
     assert {item.level for item in parked.inputs.values()} == {Level.OK}
-    assert (parked.progress.level, parked.progress.is_paused) == (Level.OK, True)
+    assert (parked.progress.level, parked.progress.is_paused) == (
+        Level.OK,
+        True,
+    )
     assert parked.progress.text == (
         "Paused: no pose of parent (/parent_odom) and child (/child_odom) for 8.0 s; "
         "continue to drive, or save."
@@ -196,11 +209,15 @@ def test_a_step_of_a_clock_is_named_and_a_gap_is_not(node, log_lines):
     run(node, 3.0, senders=["parent"])
     run(node, 2.0)
     assert not [line for line in log_lines if "jump ahead" in line]
-    assert state_of(node).inputs["child"].text.endswith(" Hz, longest gap 3.1 s")
+    assert (
+        state_of(node).inputs["child"].text.endswith(" Hz, longest gap 3.1 s")
+    )
     for _ in range(10):
         node.now[0] += 0.1
         stamp_ns = round((node.now[0] + 30.0) * 1e9)
-        node.inputs[1].accept(stamp_ns, lambda stamp_ns=stamp_ns: pose_at(stamp_ns))
+        node.inputs[1].accept(
+            stamp_ns, lambda stamp_ns=stamp_ns: pose_at(stamp_ns)
+        )
     (line,) = [line for line in log_lines if "jump ahead" in line]
     assert line.startswith("/child_odom: the stamps jump ahead by 30.1")
     assert state_of(node).inputs["child"].text.endswith("longest gap 30 s")
@@ -221,7 +238,11 @@ def test_two_publishers_on_one_topic_are_a_warning_with_their_names(node):
     view = view_of(state)
     assert (view.word, view.tone) == ("CHECK INPUT", Tone.ACT)
     assert np.all(
-        [line.tone is Tone.ACT for line in view.health if line.name == "child input"]
+        [
+            line.tone is Tone.ACT
+            for line in view.health
+            if line.name == "child input"
+        ]
     )
 
 

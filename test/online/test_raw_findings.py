@@ -49,7 +49,9 @@ def checked(parent, child, limits=QUICK):
             feed(calibrator, stream, trajectory[is_now])
     result = answer(Job(0, calibrator, check=True))
     return calibrator, {
-        finding.code for finding in result.check.findings if finding.makes_unusable
+        finding.code
+        for finding in result.check.findings
+        if finding.makes_unusable
     }
 
 
@@ -67,13 +69,20 @@ def test_two_sources_are_found_after_poses_were_paired_also_if_one_came_later(
 
 def raw(code="interleaved", **fields):
     return written_finding(
-        code, Severity.ERROR, "it alternates", "part it", stream="child", **fields
+        code,
+        Severity.ERROR,
+        "it alternates",
+        "part it",
+        stream="child",
+        **fields,
     )
 
 
 @pytest.fixture
 def checks():
-    silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
+    silent = dict.fromkeys(
+        ("debug", "info", "warning", "error"), lambda text: None
+    )
     return StreamChecks(NodeLog(SimpleNamespace(**silent)))
 
 
@@ -94,7 +103,8 @@ def test_what_only_raw_poses_show_stays_until_a_reset(checks, fault, stays):
         checks.take(CheckResult(()))
     assert codes_of(checks.findings) == [fault.code] * stays
     assert [
-        fault.code in text or fault.what in text for text in checks.state().findings
+        fault.code in text or fault.what in text
+        for text in checks.state().findings
     ] == ([True] * stays)
     checks.restart()
     assert (checks.findings, checks.state().findings) == ((), ())
@@ -118,7 +128,9 @@ def test_a_lasting_fault_forbids_results_of_every_kind_of_streams(
         submit=lambda job: None, stop=lambda s: None, answers=list
     )
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
-    silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
+    silent = dict.fromkeys(
+        ("debug", "info", "warning", "error"), lambda text: None
+    )
     log = NodeLog(SimpleNamespace(**silent))
     session = LiveSession(log, CalibratorConfig())
     targets = CalibratorConfig().targets
@@ -127,7 +139,9 @@ def test_a_lasting_fault_forbids_results_of_every_kind_of_streams(
     )
     cycle.ask(lambda good, text: None)
     good = good_calibration(measured=measured, warnings=())
-    cycle.conclude(Answer(0, 0.1, seen(40.0), good, check=CheckResult((raw(),))))
+    cycle.conclude(
+        Answer(0, 0.1, seen(40.0), good, check=CheckResult((raw(),)))
+    )
     cycle.conclude(Answer(0, 0.1, seen(42.0), good, check=CheckResult(())))
     assert cycle.result.verdict is Verdict.DO_NOT_USE
     assert cycle.published is None

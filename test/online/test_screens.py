@@ -48,9 +48,15 @@ def full_bars():
     return dict.fromkeys(AXIS_KEYS.values(), row)
 
 
-DONE = REACHED | {"axes": full_bars(), "sentence": "Done: good to 4 mm. Stop and save."}
+DONE = REACHED | {
+    "axes": full_bars(),
+    "sentence": "Done: good to 4 mm. Stop and save.",
+}
 UNSEEN = AxisProgress(sigma=INF, target=0.02, seconds_left=INF)
-NOTHING = {"axes": dict.fromkeys(AXIS_KEYS.values(), UNSEEN), "limiting_axis": ""}
+NOTHING = {
+    "axes": dict.fromkeys(AXIS_KEYS.values(), UNSEEN),
+    "limiting_axis": "",
+}
 HEIGHT_UNKNOWN = {"z": replace(BEHIND, seconds_left=INF)}
 HAND = "Drive over a ramp or a kerb, or measure it by hand."
 
@@ -67,21 +73,28 @@ def at(sentence, **fields):
 def stream(name, text, **fields):
     """Both inputs; one of them needs a person."""
     both = inputs()
-    both = {key: replace(both[key], topic=f"/{key}_odom", messages=9) for key in both}
-    return both | {name: replace(both[name], level=Level.WARN, text=text, **fields)}
+    both = {
+        key: replace(both[key], topic=f"/{key}_odom", messages=9)
+        for key in both
+    }
+    return both | {
+        name: replace(both[name], level=Level.WARN, text=text, **fields)
+    }
 
 
 def silent(name, level=Level.WARN):
     text = f"/{name}_odom has been silent for 19 s"
-    both = stream(name, text, is_paused=True, silent_s=19.0, step=START_SOURCE_AGAIN)
+    both = stream(
+        name, text, is_paused=True, silent_s=19.0, step=START_SOURCE_AGAIN
+    )
     return both | {name: replace(both[name], level=level)}
 
 
 def reason(rule, axes):
-    sentence = (
-        "the recording contradicts only errors above 12 cm along x, 19 cm y, 40 cm z"
+    sentence = "the recording contradicts only errors above 12 cm along x, 19 cm y, 40 cm z"
+    return Reason(
+        rule.name, rule.verdict, sentence, "compare with a tape", axes
     )
-    return Reason(rule.name, rule.verdict, sentence, "compare with a tape", axes)
 
 
 def judged(rule, axes=("x", "y", "z")):
@@ -110,7 +123,9 @@ FAULT = replace(
     gravest="the extrinsic changes 60 s after the start by 2.9 deg",
     step=step_after(
         replace(
-            written_finding("mount_moved", Severity.ERROR, "moves", "tighten it"),
+            written_finding(
+                "mount_moved", Severity.ERROR, "moves", "tighten it"
+            ),
             code="mount_moved",
         )
     ),
@@ -120,7 +135,9 @@ FAULT = replace(
 
 def moved():
     """A comparison in which every axis has moved."""
-    row = AxisDifference(difference=0.15, sigma=0.004, visible=0.01, verdict="moved")
+    row = AxisDifference(
+        difference=0.15, sigma=0.004, visible=0.01, verdict="moved"
+    )
     difference = Difference(
         first="a",
         second="b",
@@ -162,7 +179,8 @@ SCREENS = {
         ),
     ),
     "nothing moves": state(
-        extrinsic=moving(0.0), at=at("No result yet: move the sensors, with rotations.")
+        extrinsic=moving(0.0),
+        at=at("No result yet: move the sensors, with rotations."),
     ),
     "first seconds": state(
         extrinsic=moving(3.0),
@@ -173,12 +191,17 @@ SCREENS = {
         at=at(too_little_in_words(seen(3.0, (0.0, 0.0, 40.0)))),
     ),
     "streams do not pair": state(
-        extrinsic=moving(0.0, text="10 synchronised pose pairs are needed, found 0"),
+        extrinsic=moving(
+            0.0, text="10 synchronised pose pairs are needed, found 0"
+        ),
         at=at(NO_PAIRS),
     ),
     "no height yet": state(
         extrinsic=moving(25.0),
-        at=at(f"z cannot be determined from the motion so far. {HAND}", by_hand=("z",)),
+        at=at(
+            f"z cannot be determined from the motion so far. {HAND}",
+            by_hand=("z",),
+        ),
     ),
     "not converged": state(
         extrinsic=moving(24.0),
@@ -299,15 +322,25 @@ SCREENS = {
         ),
         level=Level.WARN,
     ),
-    "a defect": state(extrinsic=replace(EXTRINSIC, level=Level.ERROR, text="a " * 20)),
+    "a defect": state(
+        extrinsic=replace(EXTRINSIC, level=Level.ERROR, text="a " * 20)
+    ),
     "no disk": state(extrinsic=GOOD, journal=FULL),
-    "ended": replace(state(extrinsic=GOOD, at=DONE, saved=SAVED), has_ended=True),
+    "ended": replace(
+        state(extrinsic=GOOD, at=DONE, saved=SAVED), has_ended=True
+    ),
     "ended with care": replace(
-        state(extrinsic=CARE, at=DONE, saved=replace(SAVED, verdict="USE WITH CARE")),
+        state(
+            extrinsic=CARE,
+            at=DONE,
+            saved=replace(SAVED, verdict="USE WITH CARE"),
+        ),
         has_ended=True,
     ),
     "ended, not to be used": replace(
-        state(extrinsic=REFUTED, at=at("No usable result: a prior."), saved=NO_USE),
+        state(
+            extrinsic=REFUTED, at=at("No usable result: a prior."), saved=NO_USE
+        ),
         has_ended=True,
     ),
     "ended before a result": replace(
@@ -336,7 +369,9 @@ def test_a_session_is_done_with_each_reason_in_a_few_words(rule, axes):
     extrinsic = replace(GOOD, result=judged(rule, tuple(axes)))
     verdict = rule.verdict.value
     saved = replace(SAVED, verdict=verdict)
-    documents = [replace(state(extrinsic=extrinsic, saved=saved), has_ended=True)]
+    documents = [
+        replace(state(extrinsic=extrinsic, saved=saved), has_ended=True)
+    ]
     if rule.verdict is not Verdict.DO_NOT_USE:
         documents.append(state(extrinsic=extrinsic, at=DONE))
     for document in documents:
@@ -350,10 +385,14 @@ def test_a_session_is_done_with_each_reason_in_a_few_words(rule, axes):
 @pytest.mark.parametrize("severity", [Severity.ERROR, Severity.WARNING])
 @pytest.mark.parametrize("code", ["mount_moved", "interleaved", "lengths"])
 @pytest.mark.parametrize("n_words", [4, 40])
-def test_a_fault_of_the_streams_has_a_next_step(code, severity, has_options, n_words):
+def test_a_fault_of_the_streams_has_a_next_step(
+    code, severity, has_options, n_words
+):
     options = {"time_offset": 0.02} if has_options else {}
     advice = "correct " + "that " * n_words
-    fault = written_finding(code, severity, "a " * n_words, advice, options=options)
+    fault = written_finding(
+        code, severity, "a " * n_words, advice, options=options
+    )
     is_reset = fault.makes_unusable and not has_options
     checks = replace(
         FAULT, gravest=fault.what, step=step_after(fault), needs_reset=is_reset
@@ -361,18 +400,27 @@ def test_a_fault_of_the_streams_has_a_next_step(code, severity, has_options, n_w
     document = state(extrinsic=GOOD, checks=checks)
     view = view_of(document)
     assert list(faults_of(view, document)) == []
-    assert (view.word, view.asked) == ("CHECK THE STREAMS", "reset" if is_reset else "")
+    assert (view.word, view.asked) == (
+        "CHECK THE STREAMS",
+        "reset" if is_reset else "",
+    )
 
 
 BROKEN = {
-    "a verdict that is not named": (SCREENS["done with care"], {"sentence": "Good."}),
+    "a verdict that is not named": (
+        SCREENS["done with care"],
+        {"sentence": "Good."},
+    ),
     "two times left": (SCREENS["time left"], {"advice": "Confirming, 20 s."}),
     "no step": (SCREENS["one stream is silent"], {"advice": ""}),
     "a reset out of reach": (SCREENS["two publishers"], {"asked": ""}),
     "no field": (SCREENS["flat"], {"by_hand": ()}),
     "jargon": (SCREENS["flat"], {"sentence": "Raise max_gap by hand."}),
     "too long": (SCREENS["flat"], {"sentence": "a " * 16 + "by hand."}),
-    "a name twice": (SCREENS["two publishers"], {"sentence": "/a and /a: reset."}),
+    "a name twice": (
+        SCREENS["two publishers"],
+        {"sentence": "/a and /a: reset."},
+    ),
     "a form after the end": (SCREENS["ended"], {"by_hand": ("z",)}),
     "START while moving": (SCREENS["not converged"], {"word": "START"}),
     "early advice": (

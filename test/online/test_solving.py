@@ -117,7 +117,9 @@ def test_gives_the_same_bits_as_here_job_after_job(start):
         here = answer(Job(session, poses(**options), check=True))
         assert remote.session == session
         for name in ("T_parent_child", "covariance", "objective", "sigmas"):
-            values = [getattr(result.calibration, name) for result in (remote, here)]
+            values = [
+                getattr(result.calibration, name) for result in (remote, here)
+            ]
             assert_array_equal(*values, err_msg=f"{name} with {options}")
         assert remote.check.findings == here.check.findings
         assert remote.motion.n_poses == here.motion.n_poses == 250
@@ -133,7 +135,11 @@ def test_only_a_job_in_a_hurry_has_the_priority_of_the_node(start):
     of_node = os.getpriority(os.PRIO_PROCESS, 0)
     lower = min(of_node + 3, 19)
     process = start(PRIORITY)
-    for has_hurry, priority in ((False, lower), (True, of_node), (False, lower)):
+    for has_hurry, priority in (
+        (False, lower),
+        (True, of_node),
+        (False, lower),
+    ):
         process.submit(Job(0, poses(), has_hurry=has_hurry))
         assert process.next().seconds == priority
 
@@ -149,8 +155,13 @@ def test_what_is_missing_and_defects_are_told_apart():
     missing = answer(Job(0, Calibrator(), check=True))
     assert "no poses on the parent stream" in missing.failure.what
     assert (missing.failure.is_early, missing.failure.details) == (True, "")
-    assert (missing.is_checked, missing.check) == (True, None)  # these tell too little
-    unusable = answer(Job(0, poses(parent_frame="one", child_frame="one"))).failure
+    assert (missing.is_checked, missing.check) == (
+        True,
+        None,
+    )  # these tell too little
+    unusable = answer(
+        Job(0, poses(parent_frame="one", child_frame="one"))
+    ).failure
     assert (unusable.is_early, unusable.details) == (False, "")
     broken = poses()
     broken.config = None
@@ -221,7 +232,9 @@ time.sleep(3600.0)
 
 
 @pytest.mark.parametrize("pairing_starts", [2000, 100])
-def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts):
+def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(
+    pairing_starts,
+):
     limits = BufferLimits(pairing_starts=pairing_starts, batch=64)
     calibrator = Calibrator(CalibratorConfig(reference="B3"), limits)
     parent = wandering_poses(400)
@@ -245,7 +258,9 @@ def test_what_a_check_is_certain_of_is_solved_with_as_in_a_replay(pairing_starts
     again = answer(Job(1, calibrator, check=True, options=first.options))
     assert again.calibration.time_offset_s == pytest.approx(0.3, abs=0.01)
     for result in (first, again):
-        assert_array_equal(result.calibration.T_parent_child, replayed.T_parent_child)
+        assert_array_equal(
+            result.calibration.T_parent_child, replayed.T_parent_child
+        )
         assert_array_equal(result.calibration.covariance, replayed.covariance)
     assert (again.options, again.messages) == ({}, ())
     assert "time_offset" not in codes_of(again.check.findings)

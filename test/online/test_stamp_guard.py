@@ -45,7 +45,8 @@ INTERVALS_NS = np.random.default_rng(1).exponential(1e8, 1000).astype(int)
         OVERTAKEN,
         (START_NS + np.cumsum(INTERVALS_NS)).tolist(),
         *(
-            stamps(100) + stamps(200, START_NS + 100 * STEP_NS, round(STEP_NS * factor))
+            stamps(100)
+            + stamps(200, START_NS + 100 * STEP_NS, round(STEP_NS * factor))
             for factor in (0.1, 0.5, 2, 10)
         ),
         stamps(10) + stamps(10, START_NS + 600 * 10**9),
@@ -78,7 +79,9 @@ def test_a_regular_stream_does_not_wait():
 offsets = st.one_of(
     st.integers(1, TEN_YEARS_NS),
     st.integers(0, 58).map(lambda power: min(2**power, TEN_YEARS_NS)),
-    st.integers(1, 200).map(lambda periods: periods * STEP_NS),  # onto others' places
+    st.integers(1, 200).map(
+        lambda periods: periods * STEP_NS
+    ),  # onto others' places
 )
 corruptions = st.lists(
     st.tuples(st.integers(12, 186), offsets, st.sampled_from([-1, 1])),
@@ -98,7 +101,9 @@ def test_corrupt_stamps_change_nothing(corrupt):
     assert not any(jumps)
     assert sorted(taken + dropped) == sorted(sequence)
     corrupted = {index for index, _, _ in corrupt}
-    right = {stamp for index, stamp in enumerate(sequence) if index not in corrupted}
+    right = {
+        stamp for index, stamp in enumerate(sequence) if index not in corrupted
+    }
     assert right <= set(taken)
 
 
@@ -173,7 +178,9 @@ def test_a_new_session_takes_any_stamp():
 
 
 @pytest.mark.parametrize("jump_s", [0.35, 30.0, 1000.0])
-def test_the_last_message_before_a_silence_costs_no_session_if_it_is_corrupt(jump_s):
+def test_the_last_message_before_a_silence_costs_no_session_if_it_is_corrupt(
+    jump_s,
+):
     guard = StampGuard()
     run(guard, [*stamps(50), START_NS + 49 * STEP_NS + round(jump_s * 1e9)])
     rest = stamps(50, START_NS + 51 * STEP_NS)

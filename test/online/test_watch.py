@@ -45,7 +45,9 @@ def test_evidence_is_displayed_at_the_end_alone():
     extrinsic = replace(EXTRINSIC, result=replace(RESULT, facts=(fact,)))
     view = view_of(state(at=REACHED, extrinsic=extrinsic))
     assert view.word == "DONE"
-    assert [line.text for line in view.result if line.name == "evidence"] == [fact]
+    assert [line.text for line in view.result if line.name == "evidence"] == [
+        fact
+    ]
     assert fact in fragment(view)
     assert fact not in fragment(view_of(state(extrinsic=extrinsic)))
 
@@ -106,7 +108,9 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("hostile", HOSTILE, ids=lambda value: repr(value)[:12])
-@pytest.mark.parametrize("kind", ["calibrates", "watches", "cannot write", "saved"])
+@pytest.mark.parametrize(
+    "kind", ["calibrates", "watches", "cannot write", "saved"]
+)
 def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
     states = {
         "calibrates": state(),
@@ -129,7 +133,13 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
 @pytest.mark.parametrize(
     ("document", "now_s", "tone", "word", "sentence"),
     [
-        (None, 0.5, Tone.UNKNOWN, "NO NODE", "No message from a calibrator yet."),
+        (
+            None,
+            0.5,
+            Tone.UNKNOWN,
+            "NO NODE",
+            "No message from a calibrator yet.",
+        ),
         (state(), 9.0, Tone.BAD, "SILENT", "No message from the node for 9 s."),
         (state(), 0.5, Tone.BUSY, "GO ON", "Go on for about 25 s"),
         (state(level=Level.WARN), 0.5, Tone.ACT, "CHANGE THE MOTION", "Go on"),
@@ -141,7 +151,9 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
             "Go on",
         ),
         (
-            state(at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}),
+            state(
+                at={"done": True, "is_faulty": True, "sentence": "Stop: feet."}
+            ),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Stop: "),
         ),
         (state(at=REACHED), 0.5, Tone.GOOD, "DONE", "Good to 4 mm."),
@@ -160,12 +172,18 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
             "/odom: bad",
         ),
         (
-            state(checks=replace(CHECKS, level=Level.WARN, text="lengths are feet")),
+            state(
+                checks=replace(
+                    CHECKS, level=Level.WARN, text="lengths are feet"
+                )
+            ),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "Lengths are feet."),
         ),
         (
             state(
-                checks=replace(CHECKS, level=Level.WARN, text="a; b: c", gravest="a")
+                checks=replace(
+                    CHECKS, level=Level.WARN, text="a; b: c", gravest="a"
+                )
             ),
             *(0.5, Tone.ACT, "CHECK THE STREAMS", "A."),
         ),
@@ -185,7 +203,10 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
         (
             state(
                 extrinsic=replace(
-                    EXTRINSIC, level=Level.WARN, text="a; b: c", contradicted=("z",)
+                    EXTRINSIC,
+                    level=Level.WARN,
+                    text="a; b: c",
+                    contradicted=("z",),
                 )
             ),
             *(
@@ -199,7 +220,13 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
             state(checks=replace(CHECKS, level=Level.WARN, age_s=None)),
             *(0.5, Tone.BUSY, "GO ON", "Go on for"),
         ),
-        (mount(**ERROR, text="it moved"), 0.5, Tone.BAD, "MOUNT MOVED", "It moved."),
+        (
+            mount(**ERROR, text="it moved"),
+            0.5,
+            Tone.BAD,
+            "MOUNT MOVED",
+            "It moved.",
+        ),
         (mount(), 0.5, Tone.GOOD, "WATCHING", "It has not."),
         (mount(is_learning=True), 0.5, Tone.BUSY, "LEARNING", "It has not."),
         (
@@ -209,7 +236,13 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
             "NOT WATCHING",
             "No URDF.",
         ),
-        (state(journal=FULL), 0.5, Tone.BAD, "BROKEN", "The session cannot be "),
+        (
+            state(journal=FULL),
+            0.5,
+            Tone.BAD,
+            "BROKEN",
+            "The session cannot be ",
+        ),
         (
             state(journal=FULL, at=REACHED, saved=SAVED),
             0.5,
@@ -240,7 +273,12 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
         ),
         (
             replace(state(), has_ended=True, saved=SAVED),
-            *(9.0, Tone.GOOD, "ENDED", "The node has ended. The result was saved at "),
+            *(
+                9.0,
+                Tone.GOOD,
+                "ENDED",
+                "The node has ended. The result was saved at ",
+            ),
         ),
     ],
 )
@@ -261,9 +299,16 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
     )
     assert [bar.name for bar in bars.values()][2:4] == ["along z", "about x"]
     assert {bar.meaning for bar in bars.values()} == {""}
-    on_wheels = view_of(state(extrinsic=replace(EXTRINSIC, has_vehicle_axes=True)))
-    assert [bar.meaning for bar in on_wheels.bars][2:4] == ["up", "tilt to a side"]
-    assert ["sketch" in fragment(view) for view in (on_wheels, view_of(state()))] == [
+    on_wheels = view_of(
+        state(extrinsic=replace(EXTRINSIC, has_vehicle_axes=True))
+    )
+    assert [bar.meaning for bar in on_wheels.bars][2:4] == [
+        "up",
+        "tilt to a side",
+    ]
+    assert [
+        "sketch" in fragment(view) for view in (on_wheels, view_of(state()))
+    ] == [
         True,
         False,
     ]
@@ -305,7 +350,10 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     view = view_of(state())
     values = dict(view.values)
     assert view.title == "pose of camera in lidar"
-    assert (values["x"], values["roll"]) == ("0.420 m ± 4 mm", "0.57 ± 0.57 deg")
+    assert (values["x"], values["roll"]) == (
+        "0.420 m ± 4 mm",
+        "0.57 ± 0.57 deg",
+    )
     assert values["z"] == "? not observed"
     moved = replace(EXTRINSIC, motion_s=75.0)
     assert view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion"
@@ -348,8 +396,14 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         "solve",
         "/home/live",
     )
-    assert (saved.result[-1].name, saved.result[-1].tone) == ("saved", Tone.GOOD)
-    assert (view.result[0].tone, view.result[0].text) == (Tone.ACT, "USE WITH CARE")
+    assert (saved.result[-1].name, saved.result[-1].tone) == (
+        "saved",
+        Tone.GOOD,
+    )
+    assert (view.result[0].tone, view.result[0].text) == (
+        Tone.ACT,
+        "USE WITH CARE",
+    )
     assert view.reasons == ("a: b", "c: d")
     assert (view.result[2].tone, view.result[2].text) == (
         Tone.ACT,
@@ -357,18 +411,29 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     )
     assert view.bars[2].difference == "+3.10 ± 0.40 cm"
     assert view.bars[5].difference == "unknown"
-    assert [line.name for line in view_of(state()).result] == ["verdict", "note"]
+    assert [line.name for line in view_of(state()).result] == [
+        "verdict",
+        "note",
+    ]
     for verdict, tone in (("same", Tone.GOOD), ("cannot tell", Tone.UNKNOWN)):
         other = replace(comparison, verdict=verdict)
         assert view_of(state(comparison=other)).result[2].tone is tone
-    for broadcast, tone in ((Broadcast.ON, Tone.GOOD), (Broadcast.REFUSED, Tone.ACT)):
-        extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
+    for broadcast, tone in (
+        (Broadcast.ON, Tone.GOOD),
+        (Broadcast.REFUSED, Tone.ACT),
+    ):
+        extrinsic = replace(
+            EXTRINSIC, tf_static=broadcast, tf_static_reason="why"
+        )
         # After the end of the node, late subscribers receive nothing.
         for has_ended, expected in ((False, tone), (True, Tone.ACT)):
             line = view_of(
                 replace(state(extrinsic=extrinsic), has_ended=has_ended)
             ).result[2]
-            assert (line.tone, line.name) == (expected, "sent to other programs")
+            assert (line.tone, line.name) == (
+                expected,
+                "sent to other programs",
+            )
             texts = "nothing" in line.text, line.text.endswith(": why")
             assert texts == (has_ended, not has_ended)
 
@@ -381,7 +446,11 @@ def test_a_session_is_done_with_the_reason_of_its_verdict():
     assert view.text == "USE WITH CARE: z might be wrong. Save. Measure it."
     saved = view_of(replace(done, saved=SAVED))
     assert saved.text.startswith("USE WITH CARE: z might be wrong. Saved at ")
-    assert (saved.tone, saved.advice, saved.asked) == (Tone.ACT, "Measure it.", "")
+    assert (saved.tone, saved.advice, saved.asked) == (
+        Tone.ACT,
+        "Measure it.",
+        "",
+    )
 
 
 def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
@@ -391,7 +460,8 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
             text="the mount has moved",
             since_ns=10**18,
             newest_ns=10**18 + 130 * 10**9,
-            visible_10min=dict.fromkeys(AXIS_KEYS.values(), 0.004) | {"z": None},
+            visible_10min=dict.fromkeys(AXIS_KEYS.values(), 0.004)
+            | {"z": None},
             shift={"about_z": 0.0175, "x": 0.001},
             shift_sigma={"about_z": 0.001, "x": 0.001},
         )
@@ -399,10 +469,14 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     lines = {line.name: (line.tone, line.text) for line in view.watched}
     assert lines["about z"] == (Tone.BAD, "moved by 1 deg ± 0.057 deg")
     assert lines["along x"] == (Tone.GOOD, "not moved (detects 4 mm)")
-    assert lines["along z"] == (Tone.UNKNOWN, "cannot be watched with this motion")
+    assert lines["along z"] == (
+        Tone.UNKNOWN,
+        "cannot be watched with this motion",
+    )
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
     assert (
-        view.text == "The mount has moved. Check it, then recalibrate or acknowledge."
+        view.text
+        == "The mount has moved. Check it, then recalibrate or acknowledge."
     )
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
@@ -453,7 +527,9 @@ def test_topics_with_poses_are_listed_where_an_input_lacks_them():
     assert board.view(0.0).topics == board.topics
     assert "/lidar (nav_msgs" in drawn(board.view(0.0), 80)
     assert board.inputs == ("/odom", "/odom")
-    both = {name: replace(stream, messages=9) for name, stream in silent.items()}
+    both = {
+        name: replace(stream, messages=9) for name, stream in silent.items()
+    }
     board.take(state(inputs=both), 0.0)
     assert board.view(0.0).topics == ()
 
@@ -469,7 +545,9 @@ def drawn(view, width):
 
 @pytest.mark.parametrize("width", [60, 120])
 def test_the_terminal_shows_words_and_signs_at_every_width(width):
-    careful = replace(EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE"))
+    careful = replace(
+        EXTRINSIC, result=replace(RESULT, verdict="USE WITH CARE")
+    )
     text = drawn(view_of(state(extrinsic=careful)), width)
     words = ("▶ GO ON", "✓ enough", "! takes longest", "0.420 m", "± 4 cm of 2 cm", "━━━",
              "20.0 Hz", "USE WITH CARE")  # fmt: skip
@@ -487,14 +565,20 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
         return capsys.readouterr().out.splitlines()
 
     with _display("") as show:
-        assert printed(state(), 1.0) == ["▶ GO ON: Go on for about 25 s: z is behind."]
+        assert printed(state(), 1.0) == [
+            "▶ GO ON: Go on for about 25 s: z is behind."
+        ]
         assert (
-            printed(state(at={"sentence": "Go on for about 20 s: z is behind."}), 2.0)
+            printed(
+                state(at={"sentence": "Go on for about 20 s: z is behind."}),
+                2.0,
+            )
             == []
         )
         assert printed(state(at={"done": True}), 3.0)
         learning = [
-            mount(is_learning=True, text=f"{second} of 120 s") for second in (1, 2)
+            mount(is_learning=True, text=f"{second} of 120 s")
+            for second in (1, 2)
         ]
         assert [len(printed(document, 4.0)) for document in learning] == [1, 0]
         board.answer("save", True, "result saved", 5.0)
@@ -529,10 +613,15 @@ def test_keys_ask_and_a_reset_takes_two(typed):
     assert typed.requests.empty()
     typed("r")
     assert typed.requests.get() == "reset"
-    typed.board.take(mount(**ERROR, text="moved", since_ns=10**18), time.monotonic())
+    typed.board.take(
+        mount(**ERROR, text="moved", since_ns=10**18), time.monotonic()
+    )
     typed("ca")
     typed("c")
-    assert [typed.requests.get() for _ in range(2)] == ["acknowledge", "recalibrate"]
+    assert [typed.requests.get() for _ in range(2)] == [
+        "acknowledge",
+        "recalibrate",
+    ]
     assert (typed.session.is_over, typed.session.shows_code) == (False, False)
     typed("p")
     assert typed.session.shows_code

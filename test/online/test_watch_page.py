@@ -26,7 +26,9 @@ GO_ON = View(
     sentence="z is behind.",
     buttons=("solve", "save", "reset"),
 )
-MOVED = View(node="/calibrator", tone=Tone.BAD, word="MOUNT MOVED", sentence="by 2 cm.")
+MOVED = View(
+    node="/calibrator", tone=Tone.BAD, word="MOUNT MOVED", sentence="by 2 cm."
+)
 
 # Counts vibrations of the phone, and requests that the screen stays on, in attributes of the page.
 COUNTERS = """
@@ -60,7 +62,9 @@ class Page:
     def __init__(self, browser, server):
         self.browser = browser
         self.server = server
-        browser.open(f"http://127.0.0.1:{server.server_port}/?key=word", COUNTERS)
+        browser.open(
+            f"http://127.0.0.1:{server.server_port}/?key=word", COUNTERS
+        )
         self.wait_for_word(server.board.current.word)
 
     def show(self, shown):
@@ -84,7 +88,9 @@ class Page:
         )
 
     def wait_for_count(self, name, number):
-        self.browser.wait_for(f"document.documentElement.dataset.{name} === '{number}'")
+        self.browser.wait_for(
+            f"document.documentElement.dataset.{name} === '{number}'"
+        )
 
     def visible_buttons(self):
         return self.browser.evaluate(
@@ -147,13 +153,18 @@ class Elements(HTMLParser):
 
 def test_the_script_finds_what_it_looks_for():
     page = Elements(PAGE)
-    assert set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
+    assert (
+        set(re.findall(r'part\("([\w-]+)"\)', SCRIPT)) - {"state"} <= page.ids
+    )
     assert set(
         re.findall(r'document\.querySelector(?:All)?\("(\w+)"\)', SCRIPT)
     ) <= set(page.tags)
     assert page.data["data-file"] == list(web.SAVED)
     assert sorted(set(page.data["data-request"])) == sorted(view.KEYS)
-    assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {"request", "sure"}
+    assert set(re.findall(r"button\.dataset\.(\w+)", SCRIPT)) == {
+        "request",
+        "sure",
+    }
     assert len(page.data["data-sure"]) == 4
 
 
@@ -185,7 +196,10 @@ def test_the_title_is_the_word_of_the_newest_view(page):
         f"{Tone.BUSY.value} GO ON"
     )
     page.show(MOVED)
-    assert page.browser.evaluate("document.title") == f"{Tone.BAD.value} MOUNT MOVED"
+    assert (
+        page.browser.evaluate("document.title")
+        == f"{Tone.BAD.value} MOUNT MOVED"
+    )
     assert page.wait_for_connection("✓") == "✓ connected"
 
 
@@ -204,9 +218,13 @@ def test_a_phone_shakes_at_a_new_sentence_but_not_at_new_numbers(page):
     page.browser.click("#sound")
     page.show(replace(GO_ON, sentence="Go on for about 90 s: z takes longest."))
     page.wait_for_count("vibrations", 1)
-    page.show(replace(GO_ON, sentence="Go on for about 2 min: z takes longest."))
     page.show(
-        replace(GO_ON, sentence="Confirming, 30 s: every axis is within its target.")
+        replace(GO_ON, sentence="Go on for about 2 min: z takes longest.")
+    )
+    page.show(
+        replace(
+            GO_ON, sentence="Confirming, 30 s: every axis is within its target."
+        )
     )
     page.wait_for_count("vibrations", 2)
 
@@ -281,7 +299,9 @@ def test_the_recommended_button_stands_out_and_the_others_are_hidden(page):
 
     assert page.visible_buttons() == ["reset", "save", "solve"]
     assert main_buttons() == []
-    page.show(replace(GO_ON, word="SAVE", buttons=("save", "solve"), asked="save"))
+    page.show(
+        replace(GO_ON, word="SAVE", buttons=("save", "solve"), asked="save")
+    )
     assert page.visible_buttons() == ["save", "solve"]
     assert main_buttons() == ["save"]
     page.show(MOVED)
@@ -312,18 +332,27 @@ def test_saved_files_are_linked(page, tmp_path):
 
 
 def test_evidence_of_the_result_is_readable_at_the_end(page):
-    fact = "Errors larger than 2 cm along x would have been noticed: <b> & 0.5 deg"
-    page.show(replace(GO_ON, word="DONE", result=(Line(Tone.GOOD, "evidence", fact),)))
+    fact = (
+        "Errors larger than 2 cm along x would have been noticed: <b> & 0.5 deg"
+    )
+    page.show(
+        replace(GO_ON, word="DONE", result=(Line(Tone.GOOD, "evidence", fact),))
+    )
     assert fact in page.get(".health", "innerText")
     assert page.get(".health", "checkVisibility()")
-    assert page.get(".health", "scrollWidth") <= page.get(".health", "clientWidth")
+    assert page.get(".health", "scrollWidth") <= page.get(
+        ".health", "clientWidth"
+    )
 
 
 # ------------------------------------------------------------------------ priors
 
 
 WITH_PRIOR = replace(
-    GO_ON, word="CHECK THE VALUE", by_hand=("z", "yaw"), priors=(("z", "1.5m+/-0.02m"),)
+    GO_ON,
+    word="CHECK THE VALUE",
+    by_hand=("z", "yaw"),
+    priors=(("z", "1.5m+/-0.02m"),),
 )
 
 
@@ -361,12 +390,18 @@ def test_the_unit_and_the_button_to_remove_follow_the_axis(page):
     page.show(WITH_PRIOR)
     options = "[...axisByHand.options].map((option) => option.value)"
     assert page.browser.evaluate(options) == ["z", "yaw"]
-    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == (
+    assert (
+        page.get("#unit", "textContent"),
+        page.get("#forget", "hidden"),
+    ) == (
         "m",
         False,
     )
     choose(page, "yaw")
-    assert (page.get("#unit", "textContent"), page.get("#forget", "hidden")) == (
+    assert (
+        page.get("#unit", "textContent"),
+        page.get("#forget", "hidden"),
+    ) == (
         "deg",
         True,
     )

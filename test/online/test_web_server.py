@@ -32,7 +32,9 @@ PATIENCE_S = 120.0
 
 def test_the_fragment_is_well_formed_and_escapes_what_nodes_say():
     hostile = '<script>alert("1")</script>'
-    result = replace(RESULT, reasons=(hostile,), parent_frame="<", child_frame="&")
+    result = replace(
+        RESULT, reasons=(hostile,), parent_frame="<", child_frame="&"
+    )
     document = state(
         at={"sentence": hostile}, extrinsic=replace(EXTRINSIC, result=result)
     )
@@ -138,7 +140,10 @@ def test_an_axis_measured_by_hand_becomes_a_parameter(server):
     assert server.requests.get(timeout=PATIENCE_S) == "prior.z:=-22cm+/-2cm"
     fetch(server, "POST", "/prior?key=word&axis=yaw&value=-90&sigma=2")
     assert server.requests.get(timeout=PATIENCE_S) == "prior.yaw:=-90deg+/-2deg"
-    assert fetch(server, "POST", "/prior?key=word&axis=q&value=1&sigma=1").status == 404
+    assert (
+        fetch(server, "POST", "/prior?key=word&axis=q&value=1&sigma=1").status
+        == 404
+    )
     assert server.requests.empty()
     stuck = state(at={"will_not_get_there": True}, level=Level.WARN)
     assert 'data-by-hand="z"' in fragment(view_of(stuck))
@@ -165,7 +170,10 @@ def test_the_address_is_drawn_as_a_code(monkeypatch):
     assert qr_code("http://x") == ""
     monkeypatch.undo()
     pytest.importorskip("segno", reason="segno is not installed: '.[qr]'")
-    assert len(qr_code("http://192.168.178.43:8775/?key=Ab3dE_-9").splitlines()) > 14
+    assert (
+        len(qr_code("http://192.168.178.43:8775/?key=Ab3dE_-9").splitlines())
+        > 14
+    )
 
 
 def test_a_port_in_use_is_said_in_one_line(server):

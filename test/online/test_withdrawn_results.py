@@ -26,13 +26,20 @@ from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.saving import Saver
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.solving import Answer, Failure
-from hand_eye_calib.online.live.state import Broadcast, Level, NodeState, Standing
+from hand_eye_calib.online.live.state import (
+    Broadcast,
+    Level,
+    NodeState,
+    Standing,
+)
 from hand_eye_calib.online.watch import terminal
 from hand_eye_calib.online.watch.board import Board, Tone
 from hand_eye_calib.online.watch.web import fragment
 
 TARGETS = (0.02,) * 3 + (0.005,) * 3
-INVERSE = written_finding("inverse", Severity.ERROR, "inverse poses", "invert them")
+INVERSE = written_finding(
+    "inverse", Severity.ERROR, "inverse poses", "invert them"
+)
 
 
 def dofs(sigma_m=0.005, **verdicts):
@@ -47,7 +54,12 @@ def dofs(sigma_m=0.005, **verdicts):
 
 def result(sigma_m=0.005, **fields):
     """A result that is good on all axes, unless the fields say something else."""
-    usual = {"status": SolveStatus.OK, "noise": None, "warnings": (), "findings": ()}
+    usual = {
+        "status": SolveStatus.OK,
+        "noise": None,
+        "warnings": (),
+        "findings": (),
+    }
     usual["observability_measured"] = dofs(sigma_m)
     return dataclasses.replace(calibration(), **(usual | fields))
 
@@ -63,18 +75,24 @@ def session(monkeypatch):
         submit=lambda job: None, stop=lambda s: None, answers=list
     )
     monkeypatch.setattr(module, "SolvingProcess", lambda wake: nothing)
-    silent = dict.fromkeys(("debug", "info", "warning", "error"), lambda text: None)
+    silent = dict.fromkeys(
+        ("debug", "info", "warning", "error"), lambda text: None
+    )
     log = NodeLog(SimpleNamespace(**silent))
     live = LiveSession(log, CalibratorConfig(prior_z="1.5m+/-0.02m"))
     cycle = SolveCycle(
         live, log, print, lambda calibration: calibration, print, TARGETS
     )
     cycle.ask(lambda good, text: None)
-    return SimpleNamespace(cycle=cycle, saver=Saver(live, cycle, log), live=live)
+    return SimpleNamespace(
+        cycle=cycle, saver=Saver(live, cycle, log), live=live
+    )
 
 
 def conclude(session, motion_s, newest=None, **fields):
-    return session.cycle.conclude(Answer(0, 0.1, seen(motion_s), newest, **fields))
+    return session.cycle.conclude(
+        Answer(0, 0.1, seen(motion_s), newest, **fields)
+    )
 
 
 def state_of(session):
@@ -139,7 +157,8 @@ FAILURES = {
     "dead process": (
         {
             "failure": Failure(
-                "the solving process was ended by SIGKILL", "it was started again"
+                "the solving process was ended by SIGKILL",
+                "it was started again",
             )
         },
         Standing.OUTDATED,
@@ -240,12 +259,18 @@ def test_the_form_of_a_contradicted_prior_stays_until_it_is_removed(session):
     session.cycle.follow(session.live.calibrator.config, before)
     conclude(session, 42.0, result())
     view = view_of(session)
-    assert (view.by_hand, view.priors, "forget" in view.buttons) == ((), (), False)
+    assert (view.by_hand, view.priors, "forget" in view.buttons) == (
+        (),
+        (),
+        False,
+    )
     assert session.cycle.published is session.cycle.result
     assert len(view.values) == 6
 
 
-def test_the_end_of_a_node_with_a_refuted_result_is_no_success(session, tmp_path):
+def test_the_end_of_a_node_with_a_refuted_result_is_no_success(
+    session, tmp_path
+):
     conclude(session, 40.0, contradicted())
     session.saver.save(NodeConfig(output_directory=str(tmp_path), report=False))
     board = Board()
@@ -266,7 +291,9 @@ class TestOptions:
         session.live.reconfigure(dataclasses.replace(before, **options))
         session.cycle.follow(session.live.calibrator.config, before)
 
-    def test_a_looser_target_judges_the_present_result_without_a_solve(self, session):
+    def test_a_looser_target_judges_the_present_result_without_a_solve(
+        self, session
+    ):
         for motion_s in (20.0, 42.0):
             conclude(session, motion_s, result(0.05))
         assert not session.cycle.goal.progress.done
@@ -307,7 +334,10 @@ class TestOptions:
             ),
             (
                 {"child_kind": "exact"},
-                result(0.008, covariance_allowance=np.diag([0.05**2] * 3 + [1e-8] * 3)),
+                result(
+                    0.008,
+                    covariance_allowance=np.diag([0.05**2] * 3 + [1e-8] * 3),
+                ),
                 result(0.008),
             ),
         ],
@@ -320,11 +350,16 @@ class TestOptions:
             conclude(session, motion_s, poor)
         assert not session.cycle.goal.progress.done
         self.follow(session, **option)
-        assert session.cycle.goal.progress.sentence == "Solving with the new options."
+        assert (
+            session.cycle.goal.progress.sentence
+            == "Solving with the new options."
+        )
         conclude(session, 42.0, good)
         assert session.cycle.goal.progress.done
 
-    def test_one_result_of_a_parked_robot_does_not_confirm_itself(self, session):
+    def test_one_result_of_a_parked_robot_does_not_confirm_itself(
+        self, session
+    ):
         conclude(session, 42.0, result(0.05))
         self.follow(session, target_translation=0.1)
         for _ in range(3):

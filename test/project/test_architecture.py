@@ -15,7 +15,12 @@ from hand_eye_calib.extras.simulation.options import NoiseConfig
 # Where a library that is heavy, optional or bound to ROS may be imported.
 MESSAGES = ("nav", "sensor", "geometry", "std", "diagnostic", "tf2", "rosgraph")
 ROS_LIBRARIES = [f"{name}_msgs" for name in MESSAGES]
-ROS_LIBRARIES += ["rclpy", "rcl_interfaces", "builtin_interfaces", "rosidl_runtime_py"]
+ROS_LIBRARIES += [
+    "rclpy",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "rosidl_runtime_py",
+]
 ROS_LIBRARIES += ["std_srvs", "tf2_ros", "visualization_msgs"]
 ROS = ("online/ros/", "extras/simulation/player.py")
 PAGES = (
@@ -49,7 +54,9 @@ def breaches(package_root):
                 messages.append(
                     f"{relative}: {top} may be imported only in {', '.join(homes)}"
                 )
-            if top == PACKAGE and not (rest and (package_root / rest[0]).is_dir()):
+            if top == PACKAGE and not (
+                rest and (package_root / rest[0]).is_dir()
+            ):
                 messages.append(
                     f"{relative}: the package must not import its own public API"
                 )
@@ -88,21 +95,27 @@ def test_a_breach_is_caught(tmp_path, file, line, message):
 
 ORDER = ("core", "formats", "online", "offline", "extras")
 # Layers that a layer knows.
-BELOW = {layer: {"core", "formats", layer} for layer in ORDER} | {"extras": {*ORDER}}
+BELOW = {layer: {"core", "formats", layer} for layer in ORDER} | {
+    "extras": {*ORDER}
+}
 BELOW["core"] = {"core"}
 
 
 def modules_in_texts(path):
     """Modules of the package that texts of a file name, docstrings left out."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    alone = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    alone = {
+        id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)
+    }
     for node in ast.walk(tree):
         if (
             isinstance(node, ast.Constant)
             and isinstance(node.value, str)
             and id(node) not in alone
         ):
-            yield from re.findall(rf"{PACKAGE}\.({'|'.join(ORDER)})\b", node.value)
+            yield from re.findall(
+                rf"{PACKAGE}\.({'|'.join(ORDER)})\b", node.value
+            )
 
 
 def test_no_text_names_a_module_of_a_layer_above():
@@ -124,7 +137,9 @@ def file_imports(package_root):
     modules = {}
     for path in sorted(package_root.rglob("*.py")):
         parts = path.relative_to(package_root).with_suffix("").parts
-        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = (
+            path
+        )
     graph = {}
     for module, path in modules.items():
         targets = set()
@@ -132,7 +147,9 @@ def file_imports(package_root):
             top, _, rest = name.partition(".")
             if top != PACKAGE:
                 continue
-            while rest and rest not in modules:  # a name in a file rather than a file
+            while (
+                rest and rest not in modules
+            ):  # a name in a file rather than a file
                 rest = rest.rpartition(".")[0]
             targets.add(rest)
         graph[module] = targets - {module}
@@ -141,8 +158,12 @@ def file_imports(package_root):
 
 def without_registration(graph):
     """Imports without those of the packages' ``__init__.py``, which register lazily."""
-    packages = {name for name in graph if (SOURCE / name.replace(".", "/")).is_dir()}
-    return {name: targets for name, targets in graph.items() if name not in packages}
+    packages = {
+        name for name in graph if (SOURCE / name.replace(".", "/")).is_dir()
+    }
+    return {
+        name: targets for name, targets in graph.items() if name not in packages
+    }
 
 
 def test_no_files_import_each_other_in_a_circle():
@@ -161,9 +182,13 @@ def repeated_defaults(package_root):
     defaults = {}
     for options in (CalibratorConfig, NodeConfig, NoiseConfig):
         for field in dataclasses.fields(options):
-            defaults |= {field.name: field.default, f"{field.name}_s": field.default}
+            defaults |= {
+                field.name: field.default,
+                f"{field.name}_s": field.default,
+            }
     homes = {
-        inspect.getsourcefile(options) for options in (CalibratorConfig, NoiseConfig)
+        inspect.getsourcefile(options)
+        for options in (CalibratorConfig, NoiseConfig)
     }
     repeated = []
     for path in sorted(package_root.rglob("*.py")):
@@ -183,10 +208,18 @@ def _written_defaults(path):
         pairs = []
         if isinstance(node, ast.FunctionDef):
             taken = node.args.posonlyargs + node.args.args
-            pairs = [*zip(reversed(taken), reversed(node.args.defaults), strict=False)]
-            pairs += zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)
+            pairs = [
+                *zip(
+                    reversed(taken), reversed(node.args.defaults), strict=False
+                )
+            ]
+            pairs += zip(
+                node.args.kwonlyargs, node.args.kw_defaults, strict=True
+            )
             pairs = [(taken.arg, default) for taken, default in pairs]
-        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+        elif isinstance(node, ast.AnnAssign) and isinstance(
+            node.target, ast.Name
+        ):
             pairs = [(node.target.id, node.value)]
         for name, default in pairs:
             if isinstance(default, ast.Constant):

@@ -39,7 +39,9 @@ KNOWN = {
         (ROWS[::2], ["dnlo ipopt / dnlo fast, 443: ratio is missing"]),
         (
             [dataclasses.replace(ROWS[0], seconds=0.026), *ROWS[1:]],
-            ["dnlo ipopt / dnlo fast, 443: 38.5, below a third of the baseline's 120"],
+            [
+                "dnlo ipopt / dnlo fast, 443: 38.5, below a third of the baseline's 120"
+            ],
         ),
         (
             [dataclasses.replace(ROWS[0], objective=2.0001), *ROWS[1:]],
@@ -55,9 +57,14 @@ def test_a_row_that_falls_short_is_a_failure(measured, failures):
 
 
 def test_baseline_covers_both_sources_with_equal_ratios():
-    baseline = json.loads((BENCHMARKS / "baseline.json").read_text(encoding="utf-8"))
+    baseline = json.loads(
+        (BENCHMARKS / "baseline.json").read_text(encoding="utf-8")
+    )
     assert baseline["published"].keys() == baseline["simulated"].keys()
-    ratios = {"dnlo ipopt / dnlo fast, 443", "opencv, the fastest / dnlo fast, 2338"}
+    ratios = {
+        "dnlo ipopt / dnlo fast, 443",
+        "opencv, the fastest / dnlo fast, 2338",
+    }
     assert ratios <= baseline["published"].keys()
 
 
@@ -70,7 +77,9 @@ def test_simulated_drives_have_a_known_answer_and_as_many_pairs_as_asked_for():
 
 @pytest.mark.parametrize("method", rows.OPENCV_METHODS)
 def test_opencv_is_given_what_it_expects(method):
-    cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
+    cv2 = pytest.importorskip(
+        "cv2", reason="opencv-python-headless is not installed"
+    )
     Ts_pw_p = se3.exp(np.random.default_rng(3).normal(size=(12, 6)))
     T_cw_pw = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, 0.2, -2.0]))
     T_parent_child = rows.opencv(

@@ -42,7 +42,9 @@ SMALL = classes.RecordingClass(
     child=sensor_errors.SensorErrors(
         white=sensor_errors.sigmas(0.0005, 0.02),
         walk=sensor_errors.sigmas(0.001, 0.02),
-        slow=(sensor_errors.GaussMarkov(0.5, sensor_errors.sigmas(0.001, 0.05)),),
+        slow=(
+            sensor_errors.GaussMarkov(0.5, sensor_errors.sigmas(0.001, 0.05)),
+        ),
         scale=(0.01, 5.0),
     ),
 )
@@ -69,7 +71,10 @@ def test_ideal_weighted_estimator_scatters_by_the_bound():
     for seed in range(40):
         recording = classes.simulate(SMALL, seed)
         xi = ideal_estimate(
-            recording.sides, recording.sides[1].Ts, recording.dt, shown(recording)
+            recording.sides,
+            recording.sides[1].Ts,
+            recording.dt,
+            shown(recording),
         )
         values.append(nees(xi, recording.bound()))
     # The mean of chi-squared with 6 degrees of freedom over 40 draws: 6 +/- 0.55.
@@ -77,12 +82,16 @@ def test_ideal_weighted_estimator_scatters_by_the_bound():
 
 
 def test_information_of_heavy_tails():
-    assert sensor_errors.mixture_information(0.0, 10.0) == pytest.approx(1.0, abs=1e-6)
-    # Spikes far out are seen for what they are, and lost.
-    assert sensor_errors.mixture_information(0.1, 100.0) == pytest.approx(0.9, abs=0.01)
-    assert sensor_errors.Tail("student", factor=1e6).information() == pytest.approx(
-        1.0, abs=1e-5
+    assert sensor_errors.mixture_information(0.0, 10.0) == pytest.approx(
+        1.0, abs=1e-6
     )
+    # Spikes far out are seen for what they are, and lost.
+    assert sensor_errors.mixture_information(0.1, 100.0) == pytest.approx(
+        0.9, abs=0.01
+    )
+    assert sensor_errors.Tail(
+        "student", factor=1e6
+    ).information() == pytest.approx(1.0, abs=1e-5)
     tail = sensor_errors.Tail("student", factor=3.0)
     rng = np.random.default_rng(0)
     draws = np.array(tail.draw(rng, 20_000, 0.1))
@@ -92,7 +101,9 @@ def test_information_of_heavy_tails():
 
 
 def test_recordings_of_a_class_repeat_and_differ():
-    first, again, other = (classes.make("hand_white", seed) for seed in (1, 1, 2))
+    first, again, other = (
+        classes.make("hand_white", seed) for seed in (1, 1, 2)
+    )
     assert np.array_equal(first.child.poses, again.child.poses)
     assert not np.allclose(first.T_parent_child, other.T_parent_child)
     none = sensor_errors.SensorErrors(white=sensor_errors.sigmas(1e-9, 1e-9))
@@ -113,7 +124,9 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
     scales = (0.5, 4.0, 0.5)
     T_bc[:3, 3] /= 0.5
     T_ca[:3, 3] /= 0.5 * 4.0
-    covariances = [np.diag(variances) for variances in rng.uniform(1e-6, 1e-4, (3, 6))]
+    covariances = [
+        np.diag(variances) for variances in rng.uniform(1e-6, 1e-4, (3, 6))
+    ]
     answers = [
         _calibration(T, covariance, scale)
         for T, covariance, scale in zip(
@@ -123,7 +136,9 @@ def test_cycle_of_true_answers_closes_and_its_covariance_counts_each_answer():
     xi, covariance = misclosure(answers)
     assert_allclose(xi, 0.0, atol=1e-12)
     off = se3.exp(np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0]))
-    xi, _ = misclosure([*answers[:2], _calibration(T_ca @ off, covariances[2], 0.5)])
+    xi, _ = misclosure(
+        [*answers[:2], _calibration(T_ca @ off, covariances[2], 0.5)]
+    )
     assert xi[2] == pytest.approx(0.02)
     values = []
     for _ in range(400):
@@ -145,7 +160,9 @@ def _calibration(T_parent_child, covariance, scale):
         "covariance_measured": covariance,
         "scale": scale,
     }
-    return calibration(**fields, status=SolveStatus.OK, observability_measured=())
+    return calibration(
+        **fields, status=SolveStatus.OK, observability_measured=()
+    )
 
 
 def test_coverage_with_the_floor_is_told_apart():
@@ -167,11 +184,16 @@ def test_coverage_with_the_floor_is_told_apart():
 
 def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "CLASSES", ("hand_white", "flat_agv"))
-    rows = study.measure(study.tasks_of("dnlo", range(2), [], None), ["dnlo"], 1)
+    rows = study.measure(
+        study.tasks_of("dnlo", range(2), [], None), ["dnlo"], 1
+    )
     row_of = {row.name: row for row in rows}
     assert 0.3 < row_of["hand_white"].value("bound") < 3.0
     assert row_of["flat_agv"].value("refused") == 1.0
-    assert set(row_of["all classes"].cases["bound"]) == {"hand_white/0", "hand_white/1"}
+    assert set(row_of["all classes"].cases["bound"]) == {
+        "hand_white/0",
+        "hand_white/1",
+    }
     # Rows differ in their arguments.
     assert [*study.in_parallel(max, [(1, 2), (3, 4, 5)], 2)] == [
         2,
@@ -181,8 +203,17 @@ def test_one_class_from_end_to_end(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(study, "measure", lambda *_: rows)
     files = [tmp_path / name for name in ("page.md", "rows.csv")]
     assert study.main(["--page", str(files[0]), "--rows", str(files[1])]) == 0
-    assert "| all classes | " in files[0].read_text() == capsys.readouterr().out[:-1]
-    assert files[1].read_text().splitlines()[1].startswith("simulated,hand_white,dnlo,")
+    assert (
+        "| all classes | "
+        in files[0].read_text()
+        == capsys.readouterr().out[:-1]
+    )
+    assert (
+        files[1]
+        .read_text()
+        .splitlines()[1]
+        .startswith("simulated,hand_white,dnlo,")
+    )
 
 
 def test_absent_folders_are_named(tmp_path):
@@ -212,15 +243,22 @@ def test_there_are_more_than_a_hundred_clean_recordings_of_more_than_ten_kinds()
 def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
     text = faults.report(
         [
-            faults.Outcome(key="S5 0 hilly_1 auto", verdict="USE", findings=[], z=4.0),
             faults.Outcome(
-                key="S5 1 hilly_1 auto", verdict="USE WITH CARE", findings=[], z=9.0
+                key="S5 0 hilly_1 auto", verdict="USE", findings=[], z=4.0
+            ),
+            faults.Outcome(
+                key="S5 1 hilly_1 auto",
+                verdict="USE WITH CARE",
+                findings=[],
+                z=9.0,
             ),
             faults.Outcome(
                 key="none 0 hilly_1 auto", verdict="USE", findings=[], z=1.0
             ),
             faults.Outcome(
-                key="clean 0 hilly 50 auto", verdict="USE", findings=["note:jumps"]
+                key="clean 0 hilly 50 auto",
+                verdict="USE",
+                findings=["note:jumps"],
             ),
             faults.Outcome(
                 key="clean 0 hand_mixture_30s 50 auto",
@@ -256,5 +294,7 @@ def test_faults_that_were_built_last_change_the_streams(fault):
 
 def test_a_child_in_2d_ends_in_a_verdict(monkeypatch):
     monkeypatch.setattr(faults, "_MAX_PAIRS", 100)
-    case = faults.Case(fault="S10b", severity=2, recording="hilly_1", method="auto")
+    case = faults.Case(
+        fault="S10b", severity=2, recording="hilly_1", method="auto"
+    )
     assert faults.outcome(case, None).verdict == "DO NOT USE"

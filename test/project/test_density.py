@@ -48,7 +48,9 @@ def n_code_lines(source, tree):
             and ast.get_docstring(node, clean=False) is not None
         ):
             docstring = node.body[0]
-            lines.difference_update(range(docstring.lineno, docstring.end_lineno + 1))
+            lines.difference_update(
+                range(docstring.lineno, docstring.end_lineno + 1)
+            )
     return len(lines)
 
 
@@ -62,7 +64,9 @@ def has_number(expression):
 
 def n_constants(statement):
     """Numbers that a statement at the top of a module names, and fields of a class Tuning."""
-    if isinstance(statement, ast.ClassDef) and statement.name.endswith("Tuning"):
+    if isinstance(statement, ast.ClassDef) and statement.name.endswith(
+        "Tuning"
+    ):
         return sum(isinstance(field, ast.AnnAssign) for field in statement.body)
     if isinstance(statement, ast.Assign):
         targets = statement.targets
@@ -96,7 +100,9 @@ def test_code_is_no_more_and_no_denser_than_it_was(name):
     nodes, nodes_a_line, constants = measured(ROOT / name)
     most_nodes, most_a_line, most_constants = LIMITS[name]
     assert nodes <= most_nodes, "more code than before: can something go?"
-    assert nodes_a_line <= most_a_line, "denser code than before: give each step a line"
+    assert nodes_a_line <= most_a_line, (
+        "denser code than before: give each step a line"
+    )
     assert constants <= most_constants, (
         "more constants than before: can one be derived?"
     )

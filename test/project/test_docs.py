@@ -29,8 +29,12 @@ FINE = {"compare": (0, 3, 4)}
 
 
 def pages():
-    names = [path.relative_to(DOCS).as_posix() for path in sorted(DOCS.rglob("*.md"))]
-    return [name for name in names if blocks(name) and (RUNS_ALL or name in FEW)]
+    names = [
+        path.relative_to(DOCS).as_posix() for path in sorted(DOCS.rglob("*.md"))
+    ]
+    return [
+        name for name in names if blocks(name) and (RUNS_ALL or name in FEW)
+    ]
 
 
 def blocks(name):
@@ -41,10 +45,14 @@ def blocks(name):
         r"^```(bash|python)\n(.*?)^```", text, re.DOTALL | re.M
     ):
         if language == "python":
-            commands += [("python", block)] if "import hand_eye_calib" in text else []
+            commands += (
+                [("python", block)] if "import hand_eye_calib" in text else []
+            )
         else:
             lines = block.replace("\\\n", " ").splitlines()
-            ours = (line for line in lines if line.startswith("hand_eye_calib "))
+            ours = (
+                line for line in lines if line.startswith("hand_eye_calib ")
+            )
             commands += [
                 ("command", line) for line in ours if not ELSEWHERE.search(line)
             ]
@@ -77,7 +85,9 @@ def test_page_runs(name, folder, capsys):
         command, *arguments = shlex.split(text, comments=True)[1:]
         code = main([command, *arguments])
         output = capsys.readouterr()
-        assert code in FINE.get(command, (0, 3)), f"{text}\n{output.out}\n{output.err}"
+        assert code in FINE.get(command, (0, 3)), (
+            f"{text}\n{output.out}\n{output.err}"
+        )
         assert "error:" not in output.err
 
 
@@ -92,11 +102,15 @@ def test_every_page_is_in_the_navigation_and_short_or_has_tables_of_studies():
     site = yaml.safe_load(text)
     evidence = set(site["not_in_nav"].split())
     navigation = set(
-        re.findall(r"- (?:\w+: )?([\w/]+\.md)$", text.partition("\nnav:")[2], re.M)
+        re.findall(
+            r"- (?:\w+: )?([\w/]+\.md)$", text.partition("\nnav:")[2], re.M
+        )
     )
     every = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
     assert navigation >= every - evidence
-    texts = [(DOCS / name).read_text(encoding="utf-8") for name in every - evidence]
+    texts = [
+        (DOCS / name).read_text(encoding="utf-8") for name in every - evidence
+    ]
     assert sum(len(text.split()) for text in texts) <= MOST_WORDS
     assert evidence <= every - navigation
     assert site["theme"]["font"] is False
@@ -121,10 +135,13 @@ def test_every_public_name_is_on_the_reference_page():
     described = set(re.findall(r"^::: (\S+)$", text, re.MULTILINE))
     public = {getattr(hec, name) for name in hec.__all__}
     homes = {
-        f"{public_name.__module__}.{public_name.__name__}" for public_name in public
+        f"{public_name.__module__}.{public_name.__name__}"
+        for public_name in public
     }
     missing = {
-        home for home in homes - described if home.rpartition(".")[0] not in described
+        home
+        for home in homes - described
+        if home.rpartition(".")[0] not in described
     }
     assert missing == set()
 
@@ -170,10 +187,13 @@ DARK = "#1e2129"  # background of Material's scheme slate
 def luminance(colour):
     """Relative luminance of a colour, WCAG 2.2."""
     channels = (
-        np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)]) / 255
+        np.array([int(colour[start : start + 2], 16) for start in (1, 3, 5)])
+        / 255
     )
     linear = np.where(
-        channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4
+        channels <= 0.04045,
+        channels / 12.92,
+        ((channels + 0.055) / 1.055) ** 2.4,
     )
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
@@ -185,5 +205,7 @@ def test_text_of_the_site_has_a_contrast_of_four_and_a_half():
     for selector, body in rules:
         background = luminance(DARK if "slate" in selector else WHITE)
         for colour in re.findall(r": (#[0-9a-f]{6});", body):
-            lighter, darker = sorted([luminance(colour), background], reverse=True)
+            lighter, darker = sorted(
+                [luminance(colour), background], reverse=True
+            )
             assert (lighter + 0.05) / (darker + 0.05) >= 4.5, (selector, colour)

@@ -78,7 +78,9 @@ def test_rows_hold_the_errors_of_what_was_solved(rows):
         [row[metric] for metric in METRICS],
         np.array(expected) * [1, 180 / np.pi, 1, 180 / np.pi],
     )
-    assert_array_equal(row["T_parent_child"], solve_park(pairs).T_parent_child.ravel())
+    assert_array_equal(
+        row["T_parent_child"], solve_park(pairs).T_parent_child.ravel()
+    )
     table = table_of([row])
     assert (table["case"][0], table["why"][0]) == ("noise/0.004/run_02", "")
     assert table["published_e_at"].isna().all()
@@ -93,13 +95,16 @@ def test_best_reference_is_by_mean_over_levels_and_by_median_in_the_mixture():
             "reference": reference,
         }
         return [
-            names | dict.fromkeys(METRICS, 0.0) | {"e_at": error} for error in errors
+            names | dict.fromkeys(METRICS, 0.0) | {"e_at": error}
+            for error in errors
         ]
 
     rows = []
     for reference in REFERENCES:
         levels = (
-            ((1.0, 1.0), (5.0, 7.0)) if reference == "B10" else ((0.0, 0.0), (9.0, 9.0))
+            ((1.0, 1.0), (5.0, 7.0))
+            if reference == "B10"
+            else ((0.0, 0.0), (9.0, 9.0))
         )
         mixture = [1.0, 1.0, 90.0] if reference == "C5" else [2.0, 2.0, 2.0]
         for level, errors in zip((0.0, 0.002), levels, strict=True):
@@ -125,7 +130,10 @@ WITHOUT_OBJECTIVE = {**OFF, "published_objective": None}
         ({**OFF, "objective": 1.0 + 5e-7}, "flat"),
         ({**OFF, "objective": 1.0 + 2e-6}, "our objective is higher"),
         ({**WITHOUT_OBJECTIVE, "method": "ali"}, "never normalised"),
-        ({**WITHOUT_OBJECTIVE, "method": "zhuang", "converged": False}, "not settle"),
+        (
+            {**WITHOUT_OBJECTIVE, "method": "zhuang", "converged": False},
+            "not settle",
+        ),
         ({**WITHOUT_OBJECTIVE, "method": "park"}, "unexplained"),
         ({**OFF, **dict.fromkeys(PUBLISHED)}, ""),
     ],
@@ -136,12 +144,19 @@ def test_every_row_that_differs_says_why(changes, why):
 
 
 def test_comparison_counts_lists_and_explains(tmp_path):
-    table = table_of([A_ROW, A_ROW | {"e_at": 0.5, "e_aR": 30.0, "objective": 0.4}])
+    table = table_of(
+        [A_ROW, A_ROW | {"e_at": 0.5, "e_aR": 30.0, "objective": 0.4}]
+    )
     text = comparison.describe_rows(table)
     assert "1 of 2 (50.00 %)" in text
-    assert "| noise/0.002/run_01 | DNL | B1 | 0.5, 30 | 0.02, 0.3 | 0.4, 1 |" in text
+    assert (
+        "| noise/0.002/run_01 | DNL | B1 | 0.5, 30 | 0.02, 0.3 | 0.4, 1 |"
+        in text
+    )
     written = (
-        comparison.write_rows(tmp_path / "rows.csv", table).read_text().splitlines()
+        comparison.write_rows(tmp_path / "rows.csv", table)
+        .read_text()
+        .splitlines()
     )
     assert len(written) == 3
     assert written[2].endswith(
@@ -153,12 +168,14 @@ def tasks_of(cells):
     return {cell.method: (SOURCE, cell) for cell in cells}
 
 
-def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(tmp_path, rows):
+def test_what_is_kept_is_not_solved_again_and_processes_do_not_matter(
+    tmp_path, rows
+):
     path = tmp_path / "new" / "solved.jsonl"
     kept_rows = runner.kept(path, solve_cell, tasks_of(CELLS[:2]), 2)
-    assert [row for name in tasks_of(CELLS[:2]) for row in kept_rows[name]] == rows[
-        : -len(rows) // 3
-    ]
+    assert [
+        row for name in tasks_of(CELLS[:2]) for row in kept_rows[name]
+    ] == rows[: -len(rows) // 3]
     # What was kept shows in a mark that no solver makes; a line that was cut off is solved again.
     first, second = path.read_text().splitlines()[1:]
     path.write_text(f"\n{first.replace('run_01', 'kept')}\n{second[:-5]}")
@@ -187,10 +204,16 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
     )
     put_into_page(page, "study", "# Title\n\n| table |\n")
     assert page.read_text().splitlines()[2::2] == [
-        *("<!-- study: begin -->", "| table |", "<!-- study: end -->", "The rest.")
+        *(
+            "<!-- study: begin -->",
+            "| table |",
+            "<!-- study: end -->",
+            "The rest.",
+        )
     ]
     with pytest.raises(
-        InputError, match="has no lines <!-- other: begin --> and <!-- other: end"
+        InputError,
+        match="has no lines <!-- other: begin --> and <!-- other: end",
     ):
         put_into_page(page, "other", "| table |")
 
@@ -200,7 +223,11 @@ def test_a_text_is_put_between_the_marks_of_its_study(tmp_path):
     [
         (["table1", "--data", "simulated"], 2, "KITTI"),
         (["fig3"], 2, "--data-folder"),
-        (["fig3", "--data-folder", "{tmp}"], 1, "trajectory_calibration_experiments"),
+        (
+            ["fig3", "--data-folder", "{tmp}"],
+            1,
+            "trajectory_calibration_experiments",
+        ),
         (["fig3", "--data", "simulated", "--runs", "1"], 2, "--runs"),
     ],
 )

@@ -70,7 +70,10 @@ NEEDING = {
     ),
     "simulation": (["simulate"], "invalid choice: 'simulate'"),
     "stops": (["calibrate", *SAMPLE, "--order", "none"], "unknown '--order'"),
-    "vehicle": (["calibrate", SAMPLE[0], "--on-vehicle"], "unknown '--on-vehicle'"),
+    "vehicle": (
+        ["calibrate", SAMPLE[0], "--on-vehicle"],
+        "unknown '--on-vehicle'",
+    ),
 }
 
 
@@ -169,7 +172,8 @@ def run_with_toy(folder, source, command):
     table = copy / "extras" / "__init__.py"
     text = table.read_text(encoding="utf-8")
     table.write_text(
-        text.replace("EXTRAS = (\n", 'EXTRAS = (\n    "toy",\n'), encoding="utf-8"
+        text.replace("EXTRAS = (\n", 'EXTRAS = (\n    "toy",\n'),
+        encoding="utf-8",
     )
     return subprocess.run(
         [sys.executable, *command],
@@ -235,7 +239,9 @@ for options in ({"method": "dnl"}, {"prior": {"z": (1.0, 0.1)}}, {"parent_measur
 
 
 def test_a_new_kind_of_data_is_a_folder_and_a_line(tmp_path):
-    done = run_with_toy(tmp_path, TOY_KIND, ["-c", WITHOUT_FINDER + USE_TOY_KIND])
+    done = run_with_toy(
+        tmp_path, TOY_KIND, ["-c", WITHOUT_FINDER + USE_TOY_KIND]
+    )
     assert done.stderr == ""
     *of_streams, method, prior, other = done.stdout.splitlines()
     assert of_streams == ["flat ('z',) [] ok", "True True USE", "True"] * 2

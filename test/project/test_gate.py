@@ -7,7 +7,12 @@ import pytest
 
 from hand_eye_calib.core.base.errors import InputError
 from reproduction.gate import __main__ as gate
-from reproduction.gate.baseline import Baseline, compare, compare_new_draw, error_ratio
+from reproduction.gate.baseline import (
+    Baseline,
+    compare,
+    compare_new_draw,
+    error_ratio,
+)
 from reproduction.gate.scores import Score
 
 
@@ -58,8 +63,14 @@ WORSE = {
         lambda score: {"inside_allowance": 5},
         "with the allowance",
     ),
-    "verdicts too strict": (lambda score: {"verdict": "USE WITH CARE"}, "stricter"),
-    "no answer": (lambda score: {"verdict": ""}, "no answer: 20 recordings, before 0"),
+    "verdicts too strict": (
+        lambda score: {"verdict": "USE WITH CARE"},
+        "stricter",
+    ),
+    "no answer": (
+        lambda score: {"verdict": ""},
+        "no answer: 20 recordings, before 0",
+    ),
     "wrong without a word": (
         lambda score: {"is_wrong": True},
         "USE but wrong: 20 recordings",
@@ -75,7 +86,8 @@ def test_what_is_worse_fails_in_its_family_and_in_all(name):
     failures = failures_of(scores, before)
     for group in ("car", "all"):
         assert any(
-            text.startswith(f"{group}: ") and sentence in text for text in failures
+            text.startswith(f"{group}: ") and sentence in text
+            for text in failures
         )
 
 
@@ -91,7 +103,9 @@ def test_one_wrong_answer_among_many_fails():
 def test_equal_and_better_scores_pass():
     before = drawn_scores()
     better = [
-        dataclasses.replace(score, errors=tuple(0.9 * error for error in score.errors))
+        dataclasses.replace(
+            score, errors=tuple(0.9 * error for error in score.errors)
+        )
         for score in before
     ]
     assert failures_of(before, before) == []
@@ -124,7 +138,8 @@ def test_recordings_drawn_anew_pass_by_chance_and_fail_if_errors_are_larger():
     before = drawn_scores(0, count=80)
     new = drawn_scores(1, count=60)
     worse = [
-        dataclasses.replace(score, over_bound=3.0 * score.over_bound) for score in new
+        dataclasses.replace(score, over_bound=3.0 * score.over_bound)
+        for score in new
     ]
     assert compare_new_draw(new, before).failures == []
     assert compare_new_draw(worse, before).failures == [
@@ -144,7 +159,9 @@ def test_a_baseline_is_read_as_it_was_written(tmp_path):
     assert (read.seed, read.versions) == (7, "numpy 2")
     assert read.scores["flat_agv 0"] == refused
     assert read.scores["flat_agv 1"] == unanswered
-    assert read.scores["car 0"].errors == pytest.approx(scores[0].errors, rel=1e-3)
+    assert read.scores["car 0"].errors == pytest.approx(
+        scores[0].errors, rel=1e-3
+    )
     assert read.scores["car 0"].robust_errors == pytest.approx((0.5, 2.0))
 
 
@@ -158,12 +175,16 @@ def test_the_stored_baseline_has_all_recordings_of_both_sizes():
     stored = Baseline.read(gate.BASELINE).scores
     for numbers in (gate.USUAL, gate.QUICK):
         names = {
-            f"{family} {k}" for family, count in numbers.items() for k in range(count)
+            f"{family} {k}"
+            for family, count in numbers.items()
+            for k in range(count)
         }
         assert names <= stored.keys()
 
 
-def test_the_command_fails_if_the_baseline_was_better(tmp_path, monkeypatch, capsys):
+def test_the_command_fails_if_the_baseline_was_better(
+    tmp_path, monkeypatch, capsys
+):
     numbers = {"hand_mixture_30s": 1, "flat_agv": 1}
     monkeypatch.setattr(gate, "USUAL", numbers)
     monkeypatch.setattr(gate, "QUICK", numbers)
@@ -178,7 +199,9 @@ def test_the_command_fails_if_the_baseline_was_better(tmp_path, monkeypatch, cap
     smaller = dataclasses.replace(
         score, errors=tuple(0.5 * error for error in score.errors)
     )
-    better = dataclasses.replace(stored, scores=stored.scores | {score.name: smaller})
+    better = dataclasses.replace(
+        stored, scores=stored.scores | {score.name: smaller}
+    )
     better.write(path)
     assert gate.main([*options, "--quick"]) == 1
     assert "- all: errors are 1." in capsys.readouterr().out

@@ -96,9 +96,15 @@ def run(command, **options):
 
 def clean_environment(**extra):
     """The environment without what a parent's ROS wheels or another workspace put there."""
-    dropped = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH"}
+    dropped = {
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE",
+        "LD_LIBRARY_PATH",
+        "PYTHONPATH",
+    }
     dropped |= {"AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH"}
-    kept = {name: value for name, value in os.environ.items() if name not in dropped}
+    kept = {
+        name: value for name, value in os.environ.items() if name not in dropped
+    }
     # As in an activated virtual environment: installed commands take the interpreter on PATH.
     kept["PATH"] = os.pathsep.join(
         [str(Path(sys.executable).parent), kept.get("PATH", "")]
@@ -137,14 +143,21 @@ def third_party_imports(folder, calls=r"import_module|required\("):
             elif isinstance(node, ast.Call) and re.match(
                 calls, ast.unparse(node.func) + "("
             ):
-                names |= set(re.findall(r"'(\w+)[.']", ast.unparse(node.args[0])))
+                names |= set(
+                    re.findall(r"'(\w+)[.']", ast.unparse(node.args[0]))
+                )
     return names - set(sys.stdlib_module_names) - {PACKAGE}
 
 
 def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
     keys = {element.text for element in MANIFEST.iter("exec_depend")}
-    requirements = [declared["install_requires"], *declared["extras_require"].values()]
-    requirements = {Requirement(text).name for texts in requirements for text in texts}
+    requirements = [
+        declared["install_requires"],
+        *declared["extras_require"].values(),
+    ]
+    requirements = {
+        Requirement(text).name for texts in requirements for text in texts
+    }
     imported = third_party_imports(ROOT / PACKAGE) | third_party_imports(
         ROOT / "launch"
     )
@@ -168,7 +181,9 @@ def test_everything_imported_is_declared_for_rosdep_and_for_pip(declared):
 def test_without_libraries_of_pip_one_line_says_what_is_missing(tmp_path):
     files = ["drives/run_01/T_S1_W1.txt", "drives/run_01/T_S2_W2.txt"]
     commands = [["simulate", "--out", "drives"], ["calibrate", *files]]
-    commands.append(["calibrate", *files, "--method", "dnlo", "--backend", "ipopt"])
+    commands.append(
+        ["calibrate", *files, "--method", "dnlo", "--backend", "ipopt"]
+    )
     commands.append(["simulate", "--out", "again", "--bag", "mcap"])
     # In a process of its own: a library that is imported cannot be taken away.
     program = (
@@ -191,15 +206,21 @@ def test_without_libraries_of_pip_one_line_says_what_is_missing(tmp_path):
 def test_links_of_the_readme_are_absolute_on_other_pages(declared):
     targets = re.findall(r"\]\(([^)\s]+)\)", declared["long_description"])
     assert len(targets) > 10
-    assert [target for target in targets if not re.match(r"https://|#", target)] == []
+    assert [
+        target for target in targets if not re.match(r"https://|#", target)
+    ] == []
 
 
 def test_oldest_versions_are_pinned_at_the_declared_lower_bounds(declared):
     lines = (
-        (ROOT / "requirements" / "oldest.txt").read_text(encoding="utf-8").splitlines()
+        (ROOT / "requirements" / "oldest.txt")
+        .read_text(encoding="utf-8")
+        .splitlines()
     )
     pins = dict(line.split("==") for line in lines if "==" in line)
-    requirements = declared["install_requires"] + declared["extras_require"]["test"]
+    requirements = (
+        declared["install_requires"] + declared["extras_require"]["test"]
+    )
     bounded = [Requirement(text) for text in requirements if ">=" in text]
     assert len(bounded) > 6
     for requirement in bounded:
@@ -245,10 +266,14 @@ def test_licences_of_libraries_are_listed(declared):
 
 def test_the_versions_that_ci_ran_are_within_the_declared_bounds(declared):
     lines = (
-        (ROOT / "requirements" / "tested.txt").read_text(encoding="utf-8").splitlines()
+        (ROOT / "requirements" / "tested.txt")
+        .read_text(encoding="utf-8")
+        .splitlines()
     )
     tested = dict(line.split("==") for line in lines if "==" in line)
-    tested = {canonicalize_name(name): version for name, version in tested.items()}
+    tested = {
+        canonicalize_name(name): version for name, version in tested.items()
+    }
     for text in declared["install_requires"]:
         requirement = Requirement(text)
         assert requirement.specifier.contains(
@@ -262,10 +287,14 @@ def test_the_version_is_the_same_wherever_it_is_written(declared):
     assert version.startswith(MANIFEST.findtext("version"))
     changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.search(r"^## (\S+)", changelog, re.MULTILINE)[1] == version
-    assert f"* {version}, " in (ROOT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    assert f"* {version}, " in (ROOT / "CHANGELOG.rst").read_text(
+        encoding="utf-8"
+    )
     for page in (ROOT / "docs" / "exports").glob("*.md"):
         text = page.read_text(encoding="utf-8")
-        assert set(re.findall(r"by hand_eye_calib ([\w.]+?)\. ", text)) <= {version}
+        assert set(re.findall(r"by hand_eye_calib ([\w.]+?)\. ", text)) <= {
+            version
+        }
 
 
 def test_pip_install_gives_the_commands(declared, source, tmp_path):
@@ -279,7 +308,11 @@ def test_pip_install_gives_the_commands(declared, source, tmp_path):
         *options.split(),
         "--ignore-installed",
     ]
-    run([*pip, "--prefix", target, source], env=clean_environment(), cwd=tmp_path)
+    run(
+        [*pip, "--prefix", target, source],
+        env=clean_environment(),
+        cwd=tmp_path,
+    )
     site = next(target.glob("lib/python*/site-packages"))
     environment = clean_environment(PYTHONPATH=str(site))
 
@@ -311,7 +344,9 @@ def test_pip_install_gives_the_commands(declared, source, tmp_path):
 
 
 def assert_data_files(prefix):
-    assert (prefix / "share/ament_index/resource_index/packages" / PACKAGE).is_file()
+    assert (
+        prefix / "share/ament_index/resource_index/packages" / PACKAGE
+    ).is_file()
     share = prefix / "share" / PACKAGE
     assert (share / "package.xml").is_file()
     for folder, pattern in (("config", "*.*"), ("launch", "*.launch.py")):
@@ -333,10 +368,13 @@ class TutorialCommands(NamedTuple):
 def tutorial_commands():
     pages = [*(ROOT / "docs" / "tutorials").glob("*.md")]
     pages += [
-        ROOT / "docs" / f"{name}.md" for name in ("quickstart", "node", "installation")
+        ROOT / "docs" / f"{name}.md"
+        for name in ("quickstart", "node", "installation")
     ]
     text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
-    blocks = "\n".join(re.findall(r"```(?:bash|ini)\n(.*?)```", text, re.DOTALL))
+    blocks = "\n".join(
+        re.findall(r"```(?:bash|ini)\n(.*?)```", text, re.DOTALL)
+    )
     return TutorialCommands(
         commands=set(re.findall(rf"^{PACKAGE} ([a-z]+)", blocks, re.MULTILINE)),
         executables=set(re.findall(rf"ros2 run {PACKAGE} (\w+)", blocks)),
@@ -346,7 +384,13 @@ def tutorial_commands():
 
 def test_the_commands_of_the_tutorials_exist_after_colcon_and_after_pip():
     names = tutorial_commands()
-    assert names.commands >= {"calibrate", "calibrator", "watch", "info", "compare"}
+    assert names.commands >= {
+        "calibrate",
+        "calibrator",
+        "watch",
+        "info",
+        "compare",
+    }
     assert names.commands <= set(COMMANDS)
     assert names.executables <= set(COMMANDS)
     assert names.launch_files == {"calibrator.launch.py"}
@@ -355,7 +399,14 @@ def test_the_commands_of_the_tutorials_exist_after_colcon_and_after_pip():
 def test_colcon_lays_out_an_install_space_whose_commands_run(
     declared, source, tmp_path
 ):
-    colcon = [sys.executable, "-m", "colcon", "--log-base", tmp_path / "log", "build"]
+    colcon = [
+        sys.executable,
+        "-m",
+        "colcon",
+        "--log-base",
+        tmp_path / "log",
+        "build",
+    ]
     options = ["--base-paths", source, "--packages-select", PACKAGE]
     options += ["--event-handlers", "console_direct+"]
     run([*colcon, *options], env=clean_environment(), cwd=tmp_path)
@@ -366,14 +417,19 @@ def test_colcon_lays_out_an_install_space_whose_commands_run(
     assert set(executables) == {PACKAGE, *COMMANDS}
     for path in executables.values():
         assert (
-            path.read_text(encoding="utf-8").splitlines()[0] == "#!/usr/bin/env python3"
+            path.read_text(encoding="utf-8").splitlines()[0]
+            == "#!/usr/bin/env python3"
         )
     (tmp_path / "each.py").write_text(EACH)
-    program = f"source install/setup.bash && {sys.executable} each.py '{folder}'/*"
+    program = (
+        f"source install/setup.bash && {sys.executable} each.py '{folder}'/*"
+    )
     program += f" && '{folder}/{PACKAGE}' --version"
     # The commands of the tutorials, as a shell finds them.
     program += f" && command -v {PACKAGE} && {PACKAGE} watch --help"
-    output = run(["bash", "-c", program], env=clean_environment(), cwd=tmp_path).stdout
+    output = run(
+        ["bash", "-c", program], env=clean_environment(), cwd=tmp_path
+    ).stdout
     assert Path(output.splitlines()[0]).resolve().is_relative_to(prefix)
     for command in COMMANDS:
         assert f"usage: hand_eye_calib {command}" in output
@@ -394,8 +450,12 @@ WORKFLOWS = {
 def lines(jobs):
     """What the steps of jobs run, with the values of their matrices."""
     steps = [step for job in jobs.values() for step in job["steps"]]
-    steps_run = [line for step in steps for line in step.get("run", "").splitlines()]
-    matrices = [job.get("strategy", {}).get("matrix", {}) for job in jobs.values()]
+    steps_run = [
+        line for step in steps for line in step.get("run", "").splitlines()
+    ]
+    matrices = [
+        job.get("strategy", {}).get("matrix", {}) for job in jobs.values()
+    ]
     return steps_run + [
         line for matrix in matrices for line in matrix.get("command", [])
     ]
@@ -409,7 +469,9 @@ def test_commands_exist_jobs_end_and_leave_no_credentials():
         text = "\n".join(lines(jobs))
         assert set(re.findall(r"\bmake ([a-z-]+)", text)) <= set(targets)
         for script in re.findall(r"\S*\.ci/[a-z]+", text):
-            assert os.access(ROOT / script.removeprefix("src/hand_eye_calib/"), os.X_OK)
+            assert os.access(
+                ROOT / script.removeprefix("src/hand_eye_calib/"), os.X_OK
+            )
         for job in jobs.values():
             assert 5 <= job["timeout-minutes"] <= 120
             for step in job["steps"]:
@@ -420,7 +482,9 @@ def test_commands_exist_jobs_end_and_leave_no_credentials():
 def test_what_ci_runs_here_runs_there_and_on_every_declared_python():
     """Each step of .ci/run is a job of the workflow."""
     steps = re.findall(
-        r"^step (make [a-z-]+)", (ROOT / ".ci" / "run").read_text(), re.MULTILINE
+        r"^step (make [a-z-]+)",
+        (ROOT / ".ci" / "run").read_text(),
+        re.MULTILINE,
     )
     assert len(steps) >= 4
     assert set(steps) <= set(lines(WORKFLOWS["ci"]))
@@ -439,9 +503,13 @@ def test_rviz_shows_the_latched_extrinsic_with_its_covariance():
         "Visualization Manager"
     ]
     (extrinsic,) = (
-        display for display in rviz["Displays"] if display["Name"] == "Extrinsic"
+        display
+        for display in rviz["Displays"]
+        if display["Name"] == "Extrinsic"
     )
-    assert extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
+    assert (
+        extrinsic["Topic"]["Value"] == "/calibrator/extrinsic_with_covariance"
+    )
     assert extrinsic["Topic"]["Durability Policy"] == "Transient Local"
     assert extrinsic["Covariance"]["Position"]["Value"] is True
     (markers,) = (
@@ -456,7 +524,9 @@ def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     layout = json.loads((CONFIG / "foxglove_layout.json").read_text())
     panels = layout["configById"]
     services = [
-        panel["serviceName"] for panel in panels.values() if "serviceName" in panel
+        panel["serviceName"]
+        for panel in panels.values()
+        if "serviceName" in panel
     ]
     assert sorted(services) == [
         f"/calibrator/{name}" for name in ("reset", "save", "solve")
@@ -466,7 +536,9 @@ def test_foxglove_shows_what_the_node_publishes_and_serves_each_panel_once():
     topics = ["/calibrator/extrinsic_with_covariance", "/calibrator/markers"]
     assert list(panels["3D!extrinsic"]["topics"]) == topics
     values = [
-        path["value"] for panel in panels.values() for path in panel.get("paths", ())
+        path["value"]
+        for panel in panels.values()
+        for path in panel.get("paths", ())
     ]
     keys = set(re.findall(r'key=="([a-z._]+)"', " ".join(values)))
     assert keys == {

@@ -48,11 +48,15 @@ def patterns():
         for call in filter(is_of_re, ast.walk(tree)):
             if file not in _OF_OWN_TEXT:
                 flags = sum(
-                    getattr(re, name) for name in _FLAGS if name in ast.unparse(call)
+                    getattr(re, name)
+                    for name in _FLAGS
+                    if name in ast.unparse(call)
                 )
                 functions = {call.func.attr}
                 if call.func.attr == "compile":
-                    functions = methods_of(names.get(id(call)), tree) or {"finditer"}
+                    functions = methods_of(names.get(id(call)), tree) or {
+                        "finditer"
+                    }
                 place = f"{file}:{call.lineno} {call.func.attr}"
                 collected[place] = (call.args[0].value, flags, functions)
     return collected
@@ -60,7 +64,9 @@ def patterns():
 
 def methods_of(name, tree):
     """The methods of a compiled pattern that a module calls by the pattern's name."""
-    attributes = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    attributes = [
+        node for node in ast.walk(tree) if isinstance(node, ast.Attribute)
+    ]
     return {node.attr for node in attributes if ast.unparse(node.value) == name}
 
 
@@ -104,9 +110,9 @@ def alphabet(pattern):
                     visit(child)
 
     visit(sre.parse(pattern))
-    return sorted(characters, key=lambda character: (character.isalpha(), character))[
-        :_ALPHABET
-    ]
+    return sorted(
+        characters, key=lambda character: (character.isalpha(), character)
+    )[:_ALPHABET]
 
 
 def hostile_texts(pattern):

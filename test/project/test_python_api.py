@@ -22,13 +22,22 @@ from hand_eye_calib.core.solvers.registry import Method
 from hand_eye_calib.offline.calibrate import prior_fields
 
 # Keywords of calibrate that are no options of the engine.
-OWN_KEYWORDS = ("parent_topic", "child_topic", "prior", "ground", "progress", "checks")
+OWN_KEYWORDS = (
+    "parent_topic",
+    "child_topic",
+    "prior",
+    "ground",
+    "progress",
+    "checks",
+)
 PRIOR_FIELDS = {f"prior_{axis}" for axis in AXIS_UNITS}
 
 
 def streams(n_poses=40):
     poses = motions.wandering_poses(n_poses)
-    return motions.as_trajectory(poses), motions.as_trajectory(motions.child_of(poses))
+    return motions.as_trajectory(poses), motions.as_trajectory(
+        motions.child_of(poses)
+    )
 
 
 class TestOptionsOfCalibrate:
@@ -37,7 +46,9 @@ class TestOptionsOfCalibrate:
         return {p.name: p for p in parameters if p.kind is p.KEYWORD_ONLY}
 
     def test_they_are_those_of_the_config(self):
-        fields = {field.name: field for field in dataclasses.fields(CalibratorConfig)}
+        fields = {
+            field.name: field for field in dataclasses.fields(CalibratorConfig)
+        }
         assert set(fields) >= PRIOR_FIELDS
         keywords = self.keywords()
         assert set(keywords) == set(fields) - PRIOR_FIELDS | {*OWN_KEYWORDS}
@@ -57,7 +68,9 @@ class TestOptionsOfCalibrate:
             "hand_eye_calib.offline.calibrate.whole_snapshot",
             lambda *streams: seen.append(whole_snapshot(*streams).config),
         )
-        solved = SimpleNamespace(calibration=result_making.calibration(), snapshot=None)
+        solved = SimpleNamespace(
+            calibration=result_making.calibration(), snapshot=None
+        )
         monkeypatch.setattr(
             "hand_eye_calib.offline.calibrate.run", lambda *_, **__: solved
         )
@@ -75,23 +88,37 @@ class TestOptionsOfCalibrate:
         numbers += ["target_translation", "target_rotation"]
         numbers_given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
         numbers_given |= dict(
-            method="dnl", reference="C7", backend="ipopt", min_pairs=4, max_pairs=77
+            method="dnl",
+            reference="C7",
+            backend="ipopt",
+            min_pairs=4,
+            max_pairs=77,
         )
         numbers_given |= dict(time_offset="estimate", target_axes="z=0.1")
-        numbers_given |= dict(parent_invert="poses", child_invert="orientations")
-        numbers_given |= dict(parent_measures="rates", child_measures="rotations")
+        numbers_given |= dict(
+            parent_invert="poses", child_invert="orientations"
+        )
+        numbers_given |= dict(
+            parent_measures="rates", child_measures="rotations"
+        )
         numbers_given |= dict(parent_frame="lidar", child_frame="camera")
         numbers_given |= dict(nominal_radius=0.1, nominal_separation=0.5)
         for stream in ("parent", "child"):
-            numbers_given |= {f"{stream}_quaternion": "wxyz", f"{stream}_kind": "exact"}
+            numbers_given |= {
+                f"{stream}_quaternion": "wxyz",
+                f"{stream}_kind": "exact",
+            }
         assert set(numbers_given) | {*OWN_KEYWORDS} == set(self.keywords())
         hec.calibrate(*streams(), **numbers_given, prior={"z": (1.85, 0.02)})
         (config,) = seen
-        assert {name: getattr(config, name) for name in numbers_given} == numbers_given
+        assert {
+            name: getattr(config, name) for name in numbers_given
+        } == numbers_given
         assert config.prior() == {"z": (1.85, 0.02)}
         default = CalibratorConfig()
         assert all(
-            getattr(default, name) != value for name, value in numbers_given.items()
+            getattr(default, name) != value
+            for name, value in numbers_given.items()
         )
 
     def test_all_poses_are_used_unless_limited(self):
@@ -107,7 +134,9 @@ class TestOptionsOfCalibrate:
         warnings = " ".join(snapshot.warnings)
         assert "100,000 pose pairs are used at most" in warnings
         assert (
-            whole_snapshot(long, long, {"max_pairs": 2_000_000}).config.max_pairs
+            whole_snapshot(
+                long, long, {"max_pairs": 2_000_000}
+            ).config.max_pairs
             == 2_000_000
         )
 
@@ -132,12 +161,18 @@ class TestPrior:
     @pytest.mark.parametrize(
         ("prior", "message"),
         [
-            ({"height": (1.85, 0.02)}, "prior takes x, y, z, roll, pitch, yaw; got"),
+            (
+                {"height": (1.85, 0.02)},
+                "prior takes x, y, z, roll, pitch, yaw; got",
+            ),
             (
                 {"z": 1.85},
                 r"prior z must be \(value, standard deviation\) or a text such as .*; got 1.85",
             ),
-            ({"z": (1.85, 0.02, 3)}, r"prior z must be \(value, standard deviation\)"),
+            (
+                {"z": (1.85, 0.02, 3)},
+                r"prior z must be \(value, standard deviation\)",
+            ),
             ({"z": (1.85, float("nan"))}, "prior.z must be numbers in m"),
         ],
     )
@@ -153,7 +188,9 @@ class TestMethods:
         }
         assert {Method(name).name for name in with_reference} == with_reference
         for name in set(METHODS) - with_reference:
-            with pytest.raises(ConfigError, match=f"method '{name}' is unknown"):
+            with pytest.raises(
+                ConfigError, match=f"method '{name}' is unknown"
+            ):
                 Method(name)
 
     @pytest.mark.parametrize("name", METHODS)
@@ -168,7 +205,11 @@ class TestMethods:
                     ConfigError, match=f"method {name} has no backend {backend}"
                 ):
                     hec.calibrate(
-                        parent, child, method=name, reference="B1", backend=backend
+                        parent,
+                        child,
+                        method=name,
+                        reference="B1",
+                        backend=backend,
                     )
 
 
@@ -186,7 +227,9 @@ class TestResiduals:
         assert len(residuals) == result.n_pairs
         assert residuals == residuals[:] != residuals[1:]
         assert residuals.is_inlier.sum() == result.n_inliers
-        step_ns = 100_000_000 * (2 if METHODS[result.method].uses_reference else 1)
+        step_ns = 100_000_000 * (
+            2 if METHODS[result.method].uses_reference else 1
+        )
         assert set(residuals.end_ns - residuals.start_ns) == {step_ns}
         crosses = residuals.start_ns < parent.stamps_ns[40]
         crosses &= residuals.end_ns >= parent.stamps_ns[40]
@@ -194,7 +237,9 @@ class TestResiduals:
             (result.T_parent_child - motions.T_PARENT_CHILD)[:3, 3]
         )
         assert METHODS[name].rejects_outliers == (error_m < 1e-4)
-        assert METHODS[name].rejects_outliers == (result.n_inliers < result.n_pairs)
+        assert METHODS[name].rejects_outliers == (
+            result.n_inliers < result.n_pairs
+        )
         if METHODS[name].rejects_outliers:
             assert_array_equal(residuals.is_inlier, ~crosses)
             assert residuals.translation_m[~crosses].max() < 1e-6
@@ -206,10 +251,13 @@ class TestResiduals:
             == (result.n_pairs, 3)
         )
 
-    def test_those_of_the_adaptive_estimator_have_its_scale_and_time_offset(self):
+    def test_those_of_the_adaptive_estimator_have_its_scale_and_time_offset(
+        self,
+    ):
         times_s = np.arange(400) / 20
         parent = motions.as_trajectory(
-            motions.disturbed(motions.smooth_poses(times_s), 1, 1e-4, 1e-4), 20.0
+            motions.disturbed(motions.smooth_poses(times_s), 1, 1e-4, 1e-4),
+            20.0,
         )
         late = motions.child_of(motions.smooth_poses(times_s + 0.05))
         child = motions.as_trajectory(
@@ -221,7 +269,8 @@ class TestResiduals:
         result = hec.calibrate(parent, child, method="adaptive", checks=False)
         assert result.time_offset_s == pytest.approx(0.05, abs=1e-3)
         rms = [
-            np.sqrt((r.residuals().translation ** 2).mean()) for r in (exact, result)
+            np.sqrt((r.residuals().translation ** 2).mean())
+            for r in (exact, result)
         ]
         # Without the time offset it would be fifteen times as much.
         assert rms[1] == pytest.approx(rms[0], rel=0.2)
@@ -229,7 +278,9 @@ class TestResiduals:
     def test_files_do_not_have_them(self):
         result = hec.calibrate(*streams(), reference="B1", checks=False)
         loaded = hec.Calibration.from_dict(result.to_dict())
-        with pytest.raises(InputError, match="read from a file has no residuals"):
+        with pytest.raises(
+            InputError, match="read from a file has no residuals"
+        ):
             loaded.residuals()
 
 
@@ -281,7 +332,9 @@ def test_scalars_of_numpy_are_options_like_those_of_python(name, value):
     [10**5000, -(10**400), 1 << 64, np.array([1.0, 2.0]), 1j],
     ids=["huge", "negative", "65 bits", "array", "complex"],
 )
-@pytest.mark.parametrize("name", ["max_pairs", "threshold", "time_offset", "method"])
+@pytest.mark.parametrize(
+    "name", ["max_pairs", "threshold", "time_offset", "method"]
+)
 def test_numbers_that_no_option_can_have_are_refused_in_one_line(name, value):
     with pytest.raises(ConfigError, match=name) as caught:
         CalibratorConfig(**{name: value})
@@ -311,9 +364,15 @@ def solved():
     ("call", "message"),
     [
         (lambda _: hec.calibrate(3, CHILD), "expected a path, an array"),
-        (lambda _: hec.calibrate(PARENT), "a child is missing: pass two trajectories"),
+        (
+            lambda _: hec.calibrate(PARENT),
+            "a child is missing: pass two trajectories",
+        ),
         (lambda _: hec.calibrate("absent"), "no bag at absent"),
-        (lambda _: hec.calibrate(PARENT, "absent.tum"), "cannot read absent.tum"),
+        (
+            lambda _: hec.calibrate(PARENT, "absent.tum"),
+            "cannot read absent.tum",
+        ),
         (
             lambda _: hec.calibrate(PARENT, CHILD, parent_topic="/a"),
             "pass only the bag",
@@ -350,7 +409,10 @@ def solved():
             lambda _: hec.load(None),
             "path must be of type str or PathLike; got NoneType",
         ),
-        (lambda _: hec.plot(3), "the result must be of type Calibration; got int"),
+        (
+            lambda _: hec.plot(3),
+            "the result must be of type Calibration; got int",
+        ),
         (
             lambda result: hec.plot(result, 3),
             "ax must be three axes of Matplotlib; got int",
@@ -359,7 +421,10 @@ def solved():
             lambda result: result.report(3),
             "path must be of type str or PathLike; got int",
         ),
-        (lambda _: hec.compare(3, 4), "results must be of type Sequence; got int"),
+        (
+            lambda _: hec.compare(3, 4),
+            "results must be of type Sequence; got int",
+        ),
         (
             lambda _: hec.compare([3]),
             "each result must be of type Calibration; got int",
@@ -388,7 +453,10 @@ def solved():
             lambda _: hec.calibrate_rig({"a": 1}),
             "each trajectory must be of type Trajectory; got int",
         ),
-        (lambda _: hec.calibrate_stops(3, 4), "parent: expected poses as (N, 4, 4)"),
+        (
+            lambda _: hec.calibrate_stops(3, 4),
+            "parent: expected poses as (N, 4, 4)",
+        ),
         (
             lambda _: hec.read_arm_samples(3),
             "path must be of type str or PathLike; got int",
@@ -398,7 +466,10 @@ def solved():
             "the robot must be one of abb, fanuc",
         ),
         (lambda _: hec.simulate("x"), "seed must be of type Integral; got str"),
-        (lambda _: hec.Trajectory([1, 2], "x"), "poses must be numbers; got str"),
+        (
+            lambda _: hec.Trajectory([1, 2], "x"),
+            "poses must be numbers; got str",
+        ),
         (
             lambda _: hec.Trajectory([0.5], np.eye(4)[None]),
             "stamps_ns must be one-dimensional integ",
@@ -411,8 +482,14 @@ def solved():
             lambda _: hec.Trajectory.from_rates([1], 4),
             "rates must be numbers of shape (N, 3)",
         ),
-        (lambda _: PARENT.shifted("x"), "offset_s must be of type Real; got str"),
-        (lambda _: PARENT.scaled(None), "scale must be of type Real; got NoneType"),
+        (
+            lambda _: PARENT.shifted("x"),
+            "offset_s must be of type Real; got str",
+        ),
+        (
+            lambda _: PARENT.scaled(None),
+            "scale must be of type Real; got NoneType",
+        ),
         (
             lambda _: hec.write_trajectory(PARENT, "x.tum"),
             "path must be of type str or PathLike",
@@ -426,7 +503,10 @@ def solved():
             lambda _: hec.Calibration.from_dict(3),
             "expected format hand_eye_calib/extrinsic",
         ),
-        (lambda result: result.export("kalbr"), "unknown format 'kalbr'; known are"),
+        (
+            lambda result: result.export("kalbr"),
+            "unknown format 'kalbr'; known are",
+        ),
     ],
 )
 def test_a_wrong_argument_is_answered_in_one_line(solved, call, message):
@@ -437,10 +517,14 @@ def test_a_wrong_argument_is_answered_in_one_line(solved, call, message):
 
 
 def test_a_bag_is_calibrated_by_its_topics():
-    topics = {"parent_topic": "/lidar/odometry", "child_topic": "/camera/odometry"}
+    topics = {
+        "parent_topic": "/lidar/odometry",
+        "child_topic": "/camera/odometry",
+    }
     named = hec.calibrate("sample:drive.mcap", checks=False, **topics)
     with pytest.warns(
-        UserWarning, match="parent is /lidar/odometry, child is /camera/odometry"
+        UserWarning,
+        match="parent is /lidar/odometry, child is /camera/odometry",
     ):
         chosen = hec.calibrate("sample:drive.mcap", checks=False)
     assert named == chosen
@@ -451,7 +535,12 @@ def test_a_notebook_gets_six_numbers_in_degrees_and_three_views(solved):
     html = solved._repr_html_()
     x, y, z = solved.translation
     roll, *_ = solved.rotation.as_euler("xyz", degrees=True)
-    for number in (f"{x:.4f} ± ", f"{y:.4f} ± ", f"{z:.4f} ± ", f"{roll:.2f} ± "):
+    for number in (
+        f"{x:.4f} ± ",
+        f"{y:.4f} ± ",
+        f"{z:.4f} ± ",
+        f"{roll:.2f} ± ",
+    ):
         assert number in html
     assert solved.headline in html
     assert html.count("<svg") == 1

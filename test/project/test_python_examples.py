@@ -33,7 +33,9 @@ def names(tmp_path_factory):
     hand = parent.at(child.stamps_ns[10:810:20])
     camera = child[10:810:20]
     pairs = zip(hand.tolist(), se3.inverse(camera.poses).tolist(), strict=True)
-    (folder / "samples.yaml").write_text(json.dumps(list(pairs)), encoding="utf-8")
+    (folder / "samples.yaml").write_text(
+        json.dumps(list(pairs)), encoding="utf-8"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         yield {
@@ -63,7 +65,9 @@ def test_the_help_of_calibrate_has_every_option_with_its_default():
 def test_the_roles_may_be_exchanged(names):
     result = names["result"]
     back = hec.calibrate("camera.tum", "lidar.tum")
-    apart = se3.log(se3.inverse(result.inverse().T_parent_child) @ back.T_parent_child)
+    apart = se3.log(
+        se3.inverse(result.inverse().T_parent_child) @ back.T_parent_child
+    )
     assert (np.abs(apart) < 0.5 * np.sqrt(np.diag(back.covariance))).all()
     assert_allclose(result.inverse().sigmas, back.sigmas, rtol=0.6)
     assert_allclose(result.inverse().inverse().sigmas, result.sigmas, rtol=1e-6)
@@ -85,7 +89,9 @@ def test_the_notebook_runs_and_keeps_its_outputs(tmp_path):
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     stored = nbformat.read(EXAMPLES / "kitti_like.ipynb", as_version=4)
-    outputs = [cell.outputs for cell in stored.cells if cell.cell_type == "code"]
+    outputs = [
+        cell.outputs for cell in stored.cells if cell.cell_type == "code"
+    ]
     assert all(outputs), "make notebook runs it and keeps its outputs"
     values = "[error_cm, error_deg, table['inliers'].tolist(), on_flat_ground.unobservable()]"
     program = f"import json; print(json.dumps({values}))"
@@ -102,7 +108,15 @@ def test_the_notebook_runs_and_keeps_its_outputs(tmp_path):
 
 def test_files_are_calibrated_and_saved(tmp_path, capsys):
     main(
-        ["simulate", "--out", str(tmp_path / "drives"), "--poses", "200", "--seed", "2"]
+        [
+            "simulate",
+            "--out",
+            str(tmp_path / "drives"),
+            "--poses",
+            "200",
+            "--seed",
+            "2",
+        ]
     )
     run = tmp_path / "drives" / "run_01"
     files = (run / "T_S1_W1.txt", run / "T_S2_W2.txt", tmp_path / "result")

@@ -19,7 +19,10 @@ NODE_PAGE = ROOT / "docs" / "node.md"
 LIMITS_PAGE = ROOT / "docs" / "limits.md"
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
-    for page in (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
+    for page in (
+        *sorted(ROOT.glob("*.md")),
+        *sorted((ROOT / "docs").rglob("*.md")),
+    )
 }
 HEADER = ("Name", "Default", "Unit", "Allowed", "Meaning")
 FEWEST_WORDS = 700
@@ -36,14 +39,22 @@ def parameter_table(config):
         name = option_name(field)
         word = re.match(r"prior\.(.*)|(parent|child)_|", name)
         word = word[1] or word[2] or "nothing"
-        cells = [f"`{default(field)}`", meta["unit"], allowed(field), meaning(meta)]
+        cells = [
+            f"`{default(field)}`",
+            meta["unit"],
+            allowed(field),
+            meaning(meta),
+        ]
         alike = tuple(
             re.sub(rf"(?<![a-z]){word}(?![a-z])", "#", cell) for cell in cells
         )
         rows.setdefault(alike, []).append((name, word))
     table = [
         [", ".join(f"`{name}`" for name, _ in some)]
-        + [cell.replace("#", "/".join(word for _, word in some)) for cell in alike]
+        + [
+            cell.replace("#", "/".join(word for _, word in some))
+            for cell in alike
+        ]
         for alike, some in rows.items()
     ]
     lines = [
@@ -98,9 +109,13 @@ def test_parameter_table_is_that_of_the_code(config):
 
 def test_parameter_tables_have_no_other_rows():
     rows = re.findall(
-        r"^\| (`[a-z_.`, ]+`) \| `[^|]*` \|", PAGES["docs/node.md"], re.MULTILINE
+        r"^\| (`[a-z_.`, ]+`) \| `[^|]*` \|",
+        PAGES["docs/node.md"],
+        re.MULTILINE,
     )
-    documented = [name for row in rows for name in re.findall(r"`([a-z_.]+)`", row)]
+    documented = [
+        name for row in rows for name in re.findall(r"`([a-z_.]+)`", row)
+    ]
     assert documented == [
         option_name(field)
         for config in (CalibratorConfig, NodeConfig)
@@ -119,7 +134,9 @@ def limits_table():
         elif line.startswith("#:"):
             text.append(line.removeprefix("#:").strip())
         elif match := re.match(r"([A-Z][A-Z_]*) = ", line):
-            meaning, in_bytes, more = " ".join(text).rstrip(".").partition(" (bytes)")
+            meaning, in_bytes, more = (
+                " ".join(text).rstrip(".").partition(" (bytes)")
+            )
             limit = readable(getattr(files, match[1]), bool(in_bytes))
             lines.append(f"| {section} | {meaning}{more} | {limit} |")
             text = []
@@ -199,23 +216,31 @@ def test_every_command_has_its_line():
 @pytest.mark.parametrize("page", PAGES)
 def test_launch_arguments_make_targets_and_files_exist(page):
     """Pages name files of the package from its root, such as ``core/solvers/ipopt.py``."""
-    launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(encoding="utf-8")
+    launch_file = (ROOT / "launch" / "calibrator.launch.py").read_text(
+        encoding="utf-8"
+    )
     lines = [
-        line for line in PAGES[page].splitlines() if line.startswith("ros2 launch")
+        line
+        for line in PAGES[page].splitlines()
+        if line.startswith("ros2 launch")
     ]
     names = {name for line in lines for name in re.findall(r"(\w+):=", line)}
     parameters = {*CalibratorConfig().to_options(), *NodeConfig().to_options()}
     assert {
         name for name in names - parameters if f'"{name}"' not in launch_file
     } == set()
-    code = "\n".join(re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL))
+    code = "\n".join(
+        re.findall(r"`[^`\n]+`|```bash\n.*?```", PAGES[page], re.DOTALL)
+    )
     mentioned = set(re.findall(r"(?:^|`)make ([a-z-]+)", code, re.MULTILINE))
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert mentioned <= set(re.findall(r"^([a-z-]+):", makefile, re.MULTILINE))
     names = re.findall(r"`([a-z_]+(?:/[a-z_]+)+\.py)(?::\d+)?`", PAGES[page])
     folders = (ROOT, ROOT / "hand_eye_calib")
     assert [
-        name for name in names if not any((top / name).exists() for top in folders)
+        name
+        for name in names
+        if not any((top / name).exists() for top in folders)
     ] == []
 
 
@@ -233,10 +258,14 @@ def test_first_command_of_the_readme_prints_its_output(capsys):
     assert measured.sub("(", printed).startswith(measured.sub("(", output))
 
 
-def test_commands_of_the_readme_on_samples_run(tmp_path, monkeypatch, no_figures):
+def test_commands_of_the_readme_on_samples_run(
+    tmp_path, monkeypatch, no_figures
+):
     monkeypatch.chdir(tmp_path)
     runnable = [
-        words for words in commands(PAGES["README.md"]) if "sample:" in " ".join(words)
+        words
+        for words in commands(PAGES["README.md"])
+        if "sample:" in " ".join(words)
     ]
     assert [words[1] for words in runnable[1:]] == [
         "sample:drive.mcap",
@@ -286,7 +315,9 @@ def test_relative_link_leads_somewhere(page, target):
 
 def test_every_package_has_its_line():
     packages = (
-        PAGES["docs/architecture.md"].partition("## Packages")[2].partition("\n## ")[0]
+        PAGES["docs/architecture.md"]
+        .partition("## Packages")[2]
+        .partition("\n## ")[0]
     )
     first = " ".join(re.findall(r"^\| (`[^|]*) \|", packages, re.MULTILINE))
     table = re.findall(r"`([a-z_/]+/|[a-z_]+\.py)`", first)
@@ -305,7 +336,9 @@ def test_every_package_has_its_line():
 
 def with_tables_of_the_code(text):
     """The page with both parameter tables as they must be."""
-    tables = iter([parameter_table(CalibratorConfig), parameter_table(NodeConfig)])
+    tables = iter(
+        [parameter_table(CalibratorConfig), parameter_table(NodeConfig)]
+    )
     old = re.compile(r"^\| Name \| Default \|.*\n(\|.*\n)*", re.MULTILINE)
     return old.sub(lambda _: next(tables) + "\n", text)
 

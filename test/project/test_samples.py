@@ -21,7 +21,9 @@ from reproduction.samples import (
 def test_the_bag_has_the_poses_of_the_files():
     for sensor in ("lidar", "camera"):
         in_file = hec.read_trajectory(f"sample:{sensor}.tum")
-        in_bag = hec.read_trajectory("sample:drive.mcap", topic=f"/{sensor}/odometry")
+        in_bag = hec.read_trajectory(
+            "sample:drive.mcap", topic=f"/{sensor}/odometry"
+        )
         assert_array_equal(in_bag.stamps_ns, in_file.stamps_ns)
         assert_allclose(in_bag.poses, in_file.poses, atol=1e-12)
         assert in_bag.sensor_frame == sensor
@@ -34,7 +36,9 @@ def test_the_drive_is_calibrated_within_its_standard_deviations():
     )
     (truth,) = hec.read_trajectory("sample:truth.tum").poses
     assert result.verdict is hec.Verdict.USE
-    assert (np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas).all()
+    assert (
+        np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas
+    ).all()
     # The recording has outlier poses 42 cm off. Motions to and from them are no inliers.
     residuals = result.residuals()
     assert residuals.translation_m.max() > 0.4
@@ -43,19 +47,27 @@ def test_the_drive_is_calibrated_within_its_standard_deviations():
 
 def test_the_arm_is_calibrated_within_its_standard_deviations():
     samples = hec.read_arm_samples("sample:arm.yaml")
-    result = hec.calibrate_arm(samples.robot, samples.tracking, names=samples.frames)
+    result = hec.calibrate_arm(
+        samples.robot, samples.tracking, names=samples.frames
+    )
     truth = se3_of(CAMERA_IN_GRIPPER)
     assert result.verdict is hec.Verdict.USE
     assert (result.parent_frame, result.child_frame) == ("gripper", "camera")
-    assert (np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas).all()
+    assert (
+        np.abs(deviation(result.T_parent_child, truth)) < 3.0 * result.sigmas
+    ).all()
 
 
 def test_the_arm_is_made_by_its_script(tmp_path):
     write_sample_arm(tmp_path / "arm.yaml")
     made = hec.read_arm_samples(tmp_path / "arm.yaml")
     kept = hec.read_arm_samples("sample:arm.yaml")
-    assert_allclose(se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5)
-    assert_allclose(se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5)
+    assert_allclose(
+        se3.log(se3.inverse(made.robot) @ kept.robot), 0.0, atol=1e-5
+    )
+    assert_allclose(
+        se3.log(se3.inverse(made.tracking) @ kept.tracking), 0.0, atol=1e-5
+    )
 
 
 def test_two_files_of_the_arm_have_the_stops_of_its_samples(tmp_path):
@@ -63,7 +75,8 @@ def test_two_files_of_the_arm_have_the_stops_of_its_samples(tmp_path):
     write_sample_arm_files(tmp_path)
     for name in ("hand.tum", "camera_in_target.tum"):
         made, kept = (
-            np.loadtxt(path) for path in (tmp_path / name, local_path(f"sample:{name}"))
+            np.loadtxt(path)
+            for path in (tmp_path / name, local_path(f"sample:{name}"))
         )
         assert_allclose(made, kept, atol=2e-6)
     samples = hec.read_arm_samples("sample:arm.yaml")

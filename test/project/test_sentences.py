@@ -29,7 +29,8 @@ pytestmark = pytest.mark.usefixtures("no_figures")
 
 # The first words contain all separators of sentences; the second none.
 WITH_SEPARATORS = (
-    "{}a: b; Done: moved: USE: c (d). Save. Stop and save. 3 mm or acknowledge, e -> f"
+    "{}a: b; Done: moved: USE: c (d). Save. Stop and save. "
+    "3 mm or acknowledge, e -> f"
 )
 WITHOUT_SEPARATORS = "{}z"
 
@@ -44,7 +45,14 @@ SENTENCES = {
     "warnings",
     "text",
 }
-CUTS = {"partition", "rpartition", "split", "rsplit", "removeprefix", "removesuffix"}
+CUTS = {
+    "partition",
+    "rpartition",
+    "split",
+    "rsplit",
+    "removeprefix",
+    "removesuffix",
+}
 CUTS |= {"startswith", "endswith"}
 
 
@@ -68,8 +76,14 @@ def pages():
     careful = replace(bad, findings=bad.findings[1:])
     good = replace(bad, findings=bad.findings[2:])
     texts = {}
-    for name, calibration in (("bad", bad), ("careful", careful), ("good", good)):
-        texts[f"terminal {name}"] = "\n".join(as_lines(calibration, with_details=True))
+    for name, calibration in (
+        ("bad", bad),
+        ("careful", careful),
+        ("good", good),
+    ):
+        texts[f"terminal {name}"] = "\n".join(
+            as_lines(calibration, with_details=True)
+        )
         texts[f"report {name}"] = render(calibration, None, {})
     joint = together({"monday": careful, "tuesday": good})
     texts["terminal together"] = "\n".join(as_lines(joint))
@@ -81,7 +95,9 @@ def pages():
     texts["report rig"] = render_rig(rig, rig.sensors)
     faults = str(bad.findings[0])
     board = Board()
-    checks = ChecksState(level=Level.WARN, text=faults, age_s=1.0, findings=(faults,))
+    checks = ChecksState(
+        level=Level.WARN, text=faults, age_s=1.0, findings=(faults,)
+    )
     board.take(NodeState(node="/calibrator", checks=checks), 0.0)
     view = board.view(0.5)
     texts["watch page"] = fragment(view)
@@ -101,7 +117,9 @@ def pages_with(words, monkeypatch):
     finally:
         words_of.cache_clear()
     for name, text in texts.items():
-        text = re.sub(r"Written.*?UTC|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC", "", text)
+        text = re.sub(
+            r"Written.*?UTC|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC", "", text
+        )
         text = " ".join(text.split())
         for template in templates:
             text = text.replace(template, template.split()[0].upper())
@@ -125,7 +143,10 @@ def cuts_of(path):
     lines = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         texts = []
-        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") in CUTS:
+        if (
+            isinstance(node, ast.Call)
+            and getattr(node.func, "attr", "") in CUTS
+        ):
             texts = [node.func.value]
         elif isinstance(node, ast.Compare) and isinstance(
             node.ops[0], (ast.In, ast.NotIn)

@@ -71,7 +71,11 @@ def test_an_option_in_a_message_is_spelled_as_its_road_does(text):
 
 
 def test_options_are_joined_as_their_road_does():
-    options = {"prior.z": "VALUE+/-SIGMA", "scale": "estimate", "prior.x": "1.5+/-0.1"}
+    options = {
+        "prior.z": "VALUE+/-SIGMA",
+        "scale": "estimate",
+        "prior.x": "1.5+/-0.1",
+    }
     assert spelled_options(options.items(), Interface.PYTHON) == (
         'scale="estimate", prior={"z": (0.50, 0.02), "x": (1.5, 0.1)}'
     )
@@ -98,7 +102,9 @@ def test_the_options_of_each_finding_exist_on_all_roads(key, flags):
     assert not re.search("--[a-z]", text), "the engine writes public names"
     assert {*re.findall(r"--[a-z][a-z-]*", as_typed(text))} <= flags
     parameters = {*inspect.signature(hec.calibrate).parameters, "setup"}
-    assert {*re.findall(r"(\w+)=", spelled(text, Interface.PYTHON))} <= parameters
+    assert {
+        *re.findall(r"(\w+)=", spelled(text, Interface.PYTHON))
+    } <= parameters
     for name in CalibratorConfig.by_name():
         if "_" in name or "." in name:
             pattern = rf"(?<![\w.]){re.escape(name)}(?![\w.])"
@@ -113,20 +119,28 @@ def test_each_reason_for_unknown_axes_names_a_prior_that_python_accepts():
     poses = planar_poses(300, seed=91)
     parent = hec.Trajectory(stamps_ns, poses, sensor_frame="lidar")
     child = hec.Trajectory(stamps_ns, child_of(poses), sensor_frame="camera")
-    result = hec.calibrate(parent, child, checks=False, method="dnlo", reference="B5")
-    reason = next(reason for reason in result.reasons if reason.rule == "unobservable")
+    result = hec.calibrate(
+        parent, child, checks=False, method="dnlo", reference="B5"
+    )
+    reason = next(
+        reason for reason in result.reasons if reason.rule == "unobservable"
+    )
     assert [*reason.options] == [f"prior.{axis}" for axis in reason.axes]
     argument = re.search(r"prior=(\{.*\})", reason.what_to_do)[1]
     prior = ast.literal_eval(argument)
     assert {*prior} == {*reason.axes}
     again = hec.calibrate(parent, child, checks=False, prior=prior)
     assert not again.hidden
-    assert "such as --prior z=0.50+/-0.02" in reason.advice_on(Interface.TERMINAL)
+    assert "such as --prior z=0.50+/-0.02" in reason.advice_on(
+        Interface.TERMINAL
+    )
 
 
 def test_an_option_in_an_advice_is_not_repeated():
     options = {"scale": "estimate", "prior.yaw": PLACEHOLDER, "max_gap": 2.0}
-    text = with_options("give scale estimate, and a prior", options, Interface.TERMINAL)
+    text = with_options(
+        "give scale estimate, and a prior", options, Interface.TERMINAL
+    )
     assert text == (
         "give --scale estimate, and a prior: --max-gap 2.0, such as --prior yaw=90deg+/-2deg"
     )

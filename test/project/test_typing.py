@@ -70,10 +70,17 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
         "hand_eye_calib.core.base.text",
         "hand_eye_calib.core.base.option",
     }
-    followed = [hec.__name__, *sorted(public | of_arguments), "numpy", "numpy.*"]
+    followed = [
+        hec.__name__,
+        *sorted(public | of_arguments),
+        "numpy",
+        "numpy.*",
+    ]
     config.write_text(
         "[mypy]\nfollow_imports = skip\n"
-        + "".join(f"[mypy-{module}]\nfollow_imports = silent\n" for module in followed)
+        + "".join(
+            f"[mypy-{module}]\nfollow_imports = silent\n" for module in followed
+        )
     )
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--config-file", config, program],
@@ -87,9 +94,9 @@ def test_a_wrong_call_fails_the_type_check_and_a_right_one_passes(tmp_path):
         if ": error:" in line
     }
     lines = enumerate(PROGRAM.splitlines(), start=1)
-    assert failed == {number for number, line in lines if line.endswith("# wrong")}, (
-        done.stdout + done.stderr
-    )
+    assert failed == {
+        number for number, line in lines if line.endswith("# wrong")
+    }, done.stdout + done.stderr
 
 
 def test_the_stub_names_what_exists():
@@ -104,7 +111,9 @@ def test_the_stub_names_what_exists():
     }
     assert sorted(seen) == sorted(hec.__all__)
     for name, (module, original) in seen.items():
-        assert getattr(importlib.import_module(module), original) is getattr(hec, name)
+        assert getattr(importlib.import_module(module), original) is getattr(
+            hec, name
+        )
     assert set(hec.__all__) <= set(dir(hec))
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = hec.calibrat

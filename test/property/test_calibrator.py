@@ -3,7 +3,13 @@
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from motions import T_PARENT_CHILD, as_trajectory, child_of, messages, wandering_poses
+from motions import (
+    T_PARENT_CHILD,
+    as_trajectory,
+    child_of,
+    messages,
+    wandering_poses,
+)
 from numpy.testing import assert_allclose
 
 from hand_eye_calib.core.base.config import CalibratorConfig
@@ -63,7 +69,9 @@ def test_repetitions_change_nothing_and_are_counted(repeated, random):
 
 
 @settings(max_examples=25)
-@given(st.integers(0, 100), st.integers(1, 25), st.randoms(use_true_random=False))
+@given(
+    st.integers(0, 100), st.integers(1, 25), st.randoms(use_true_random=False)
+)
 def test_a_gap_leaves_pairs_out_but_invents_none(first, length, random):
     # Beside a gap interpolation knows less.
     kept = TOGETHER[:first] + TOGETHER[first + length :]
@@ -74,5 +82,8 @@ def test_a_gap_leaves_pairs_out_but_invents_none(first, length, random):
         stream: {message[1] for message in kept if message[0] == stream}
         for stream in ("parent", "child")
     }
-    assert set(calibrator.snapshot().pose_pairs.stamps_ns.tolist()) <= stamps["child"]
+    assert (
+        set(calibrator.snapshot().pose_pairs.stamps_ns.tolist())
+        <= stamps["child"]
+    )
     assert_allclose(result.T_parent_child, T_PARENT_CHILD, atol=1e-6)

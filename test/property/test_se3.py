@@ -54,7 +54,10 @@ def test_adjoint_moves_a_twist_across_a_transform(xi, pose_xi):
     T = se3.exp(pose_xi)
     small = 1e-3 * xi / (1 + np.linalg.norm(xi))
     assert_allclose(
-        T @ se3.exp(small), se3.exp(se3.adjoint(T) @ small) @ T, atol=1e-9, rtol=1e-9
+        T @ se3.exp(small),
+        se3.exp(se3.adjoint(T) @ small) @ T,
+        atol=1e-9,
+        rtol=1e-9,
     )
 
 

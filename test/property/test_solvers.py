@@ -16,9 +16,13 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, motion_pairs
 from hand_eye_calib.core.solvers.all_pairs import pair_costs
 from hand_eye_calib.core.solvers.registry import Method
 
-PAPER_METHODS = [name for name, record in METHODS.items() if record.uses_reference]
+PAPER_METHODS = [
+    name for name, record in METHODS.items() if record.uses_reference
+]
 # Their answer depends on nothing but sums over the pairs. dnlo searches from random subsets.
-SUMMING_METHODS = [name for name in PAPER_METHODS if not METHODS[name].rejects_outliers]
+SUMMING_METHODS = [
+    name for name in PAPER_METHODS if not METHODS[name].rejects_outliers
+]
 
 few_examples = settings(max_examples=20)
 N_POSES = 14
@@ -54,7 +58,9 @@ def drive(seed):
     largest = np.repeat([2.0, 0.8], 3)
     return walked(
         se3.exp(
-            np.random.default_rng(seed).uniform(-largest, largest, (N_POSES - 1, 6))
+            np.random.default_rng(seed).uniform(
+                -largest, largest, (N_POSES - 1, 6)
+            )
         )
     )
 
@@ -73,14 +79,18 @@ def rotation_angle(T):
 
 
 def answer(method, *trajectories):
-    return Method(method).solve(motion_pairs(*trajectories, "B1")).T_parent_child
+    return (
+        Method(method).solve(motion_pairs(*trajectories, "B1")).T_parent_child
+    )
 
 
 @pytest.mark.parametrize("method", PAPER_METHODS)
 @few_examples
 @given(seed=seeds, truth=transforms)
 def test_noise_free_truth_is_found(method, seed, truth):
-    solution = Method(method).solve(motion_pairs(*trajectories(seed, truth), "B1"))
+    solution = Method(method).solve(
+        motion_pairs(*trajectories(seed, truth), "B1")
+    )
     if method == "zhuang" and not solution.converged:
         assert rotation_angle(truth) > ZHUANG_IS_SURE_TO
         return
@@ -92,7 +102,12 @@ def test_noise_free_truth_is_found(method, seed, truth):
 
 @pytest.mark.parametrize("method", PAPER_METHODS)
 @few_examples
-@given(seed=seeds, truth=transforms, parent_world=transforms, child_world=transforms)
+@given(
+    seed=seeds,
+    truth=transforms,
+    parent_world=transforms,
+    child_world=transforms,
+)
 def test_worlds_do_not_matter(method, seed, truth, parent_world, child_world):
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
     moved = answer(method, parent_world @ Ts_pw_p, child_world @ Ts_cw_c)
@@ -112,15 +127,21 @@ def test_zhuang_knows_a_false_minimum(seed, axis, angle, shift):
     truth = se3.from_rotation_translation(
         se3.rotation_exp(angle * axis / np.linalg.norm(axis)), shift
     )
-    solution = Method("zhuang").solve(motion_pairs(*trajectories(seed, truth), "B1"))
-    assert solution.converged == np.allclose(solution.T_parent_child, truth, atol=1e-6)
+    solution = Method("zhuang").solve(
+        motion_pairs(*trajectories(seed, truth), "B1")
+    )
+    assert solution.converged == np.allclose(
+        solution.T_parent_child, truth, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
     "method", [name for name in SUMMING_METHODS if name != "zhuang"]
 )
 @few_examples
-@given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
+@given(
+    seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations
+)
 def test_answer_follows_the_sensor_frames_with_noise(
     method, seed, truth, T_parent_new, T_child_new
 ):
@@ -132,7 +153,9 @@ def test_answer_follows_the_sensor_frames_with_noise(
     """
     Ts_pw_p, Ts_cw_c = trajectories(seed, truth, noise=0.01)
     expected = (
-        se3.inverse(T_parent_new) @ answer(method, Ts_pw_p, Ts_cw_c) @ T_child_new
+        se3.inverse(T_parent_new)
+        @ answer(method, Ts_pw_p, Ts_cw_c)
+        @ T_child_new
     )
     assert_allclose(
         answer(method, Ts_pw_p @ T_parent_new, Ts_cw_c @ T_child_new),
@@ -142,7 +165,9 @@ def test_answer_follows_the_sensor_frames_with_noise(
 
 
 @few_examples
-@given(seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations)
+@given(
+    seed=seeds, truth=transforms, T_parent_new=transforms, T_child_new=rotations
+)
 def test_dnlo_follows_the_sensor_frames_with_outliers(
     seed, truth, T_parent_new, T_child_new
 ):
@@ -173,28 +198,38 @@ def test_dnlo_follows_the_sensor_frames_with_outliers(
 @given(seed=seeds, truth=transforms, order=st.permutations(range(N_POSES - 1)))
 def test_order_of_the_pairs_does_not_matter(method, seed, truth, order):
     pairs = motion_pairs(
-        *trajectories(seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0),
+        *trajectories(
+            seed, truth, noise=0.01 if method in SUMMING_METHODS else 0.0
+        ),
         "B1",
     )
     ours = Method(method).solve(pairs)
     reordered = Method(method).solve(pairs[np.array(order)])
     assert_allclose(reordered.T_parent_child, ours.T_parent_child, atol=1e-6)
-    assert reordered.objective == pytest.approx(ours.objective, rel=1e-6, abs=1e-12)
+    assert reordered.objective == pytest.approx(
+        ours.objective, rel=1e-6, abs=1e-12
+    )
 
 
 @few_examples
 @given(seed=seeds, truth=transforms)
 def test_each_cost_is_lowest_at_its_own_method(seed, truth):
     pairs = motion_pairs(*trajectories(seed, truth, noise=0.03), "B1")
-    solutions = {method: Method(method).solve(pairs) for method in PAPER_METHODS}
+    solutions = {
+        method: Method(method).solve(pairs) for method in PAPER_METHODS
+    }
     for solution in solutions.values():
         assert solutions["dnl"].objective <= pair_costs(
             pairs, solution.T_parent_child
         ).sum() * (1 + 1e-9)
         assert solutions["dnlo"].objective <= np.minimum(
             pair_costs(pairs, solution.T_parent_child), 0.01
-        ).sum() * (1 + 1e-9) or (solutions["dnlo"].weights.sum() < (len(pairs) + 1) / 2)
-    assert solutions["ali"].objective <= solutions["park"].objective * (1 + 1e-9)
+        ).sum() * (1 + 1e-9) or (
+            solutions["dnlo"].weights.sum() < (len(pairs) + 1) / 2
+        )
+    assert solutions["ali"].objective <= solutions["park"].objective * (
+        1 + 1e-9
+    )
 
 
 def degenerate_motions(seed):
@@ -219,7 +254,9 @@ def degenerate_motions(seed):
         "two pairs": [shifts[:2], turns[:2]],
         "hardly any": [1e-9 * shifts, 1e-9 * turns],
     }
-    return {kind: np.concatenate(motions, axis=1) for kind, motions in kinds.items()}
+    return {
+        kind: np.concatenate(motions, axis=1) for kind, motions in kinds.items()
+    }
 
 
 @pytest.mark.filterwarnings("error")

@@ -39,7 +39,9 @@ def tables(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tables")
     with pytest.MonkeyPatch.context() as patch:
         names = ("table1", "table2", "s-tables")
-        both = [experiment for name in names for experiment in command.GROUPS[name]]
+        both = [
+            experiment for name in names for experiment in command.GROUPS[name]
+        ]
         patch.setitem(command.GROUPS, "s-tables", both)
         return made("s-tables", folder, 1)[0], folder
 
@@ -54,21 +56,31 @@ def read(path):
 )
 def test_tables_1_and_2_are_as_printed(tables, name, drive):
     folder = tables[1]
-    best = {line["method"].lower(): line for line in read(folder / f"{name}.csv")}
+    best = {
+        line["method"].lower(): line for line in read(folder / f"{name}.csv")
+    }
     assert {method: line["variant"] for method, line in best.items()} == {
         method: PRINTED[drive][method][0] for method in METHODS
     }
     compared = read(folder / f"{name}_comparison.csv")
     assert len(compared) == 36
-    differing = {line["method"]: line for line in compared if line["agrees"] == "False"}
+    differing = {
+        line["method"]: line for line in compared if line["agrees"] == "False"
+    }
     assert set(differing) == {"DNLO"}
     assert "lower objective" in differing["DNLO"]["why"]
     for method in METHODS:
         if method != "dnlo":
             printed = [
-                value for value in PRINTED[drive][method][1:] if value is not None
+                value
+                for value in PRINTED[drive][method][1:]
+                if value is not None
             ]
-            ours = [float(value) for value in list(best[method].values())[2:8] if value]
+            ours = [
+                float(value)
+                for value in list(best[method].values())[2:8]
+                if value
+            ]
             assert ours == pytest.approx(printed, abs=5.1e-4)
 
 
@@ -85,7 +97,9 @@ def test_variant_tables_hold_every_method_on_both_drives(tables):
     rows, folder = tables
     agreeing = rows.groupby("method")["agrees"].sum().to_dict()
     assert agreeing.pop("dnlo") < 12
-    assert agreeing == dict.fromkeys(("ali", "dnl", "park", "taylor", "zhuang"), 12)
+    assert agreeing == dict.fromkeys(
+        ("ali", "dnl", "park", "taylor", "zhuang"), 12
+    )
     for number in range(1, 13):
         assert len(read(folder / f"tableS{number}.csv")) == 6
 
@@ -141,11 +155,13 @@ def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
         (line["case"], line["reference"]) for line in differing["dnl"]
     } <= FALSE_MINIMA_OF_DNL
     for line in differing["dnl"]:
-        assert float(line["objective"]) < 0.1 * float(line["objective_at_published"]), (
-            line["case"]
-        )
+        assert float(line["objective"]) < 0.1 * float(
+            line["objective_at_published"]
+        ), line["case"]
     # The last of 500 steps of an iteration that never settles may depend on rounding.
-    assert all("does not settle" in line["why"] for line in differing.get("zhuang", ()))
+    assert all(
+        "does not settle" in line["why"] for line in differing.get("zhuang", ())
+    )
     assert rows["agrees"][rows["method"] == "ali"].sum() >= 12
     objective = rows["verdict"][rows["method"] == "dnlo"].value_counts()
     assert objective.sum() == ROWS
@@ -170,4 +186,6 @@ def test_everything_from_one_command(tmp_path, few_levels, one_error_figure):
     verdicts = [line["verdict"] for line in read(tmp_path / "conclusions.csv")]
     assert len(verdicts) == 21
     assert "Does not hold" not in verdicts
-    assert all(path.stat().st_size for paths in files.values() for path in paths)
+    assert all(
+        path.stat().st_size for paths in files.values() for path in paths
+    )

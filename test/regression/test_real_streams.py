@@ -15,9 +15,18 @@ from hand_eye_calib.core.checks.check import check_streams
 from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.streams import check_lengths
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.results.calibration import DofVerdict, SolveStatus, Verdict
-from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
-from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
+from hand_eye_calib.core.results.calibration import (
+    DofVerdict,
+    SolveStatus,
+    Verdict,
+)
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
+from hand_eye_calib.formats.trajectory_files.reading import (
+    read_trajectory_files,
+)
 from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.independent import shrimp_sensors
 from reproduction.recordings import between
@@ -59,7 +68,9 @@ class TestThreeDevicesWithoutACommonClock:
             assert_allclose(result.T_parent_child[:3, 3], expected, atol=0.02)
 
     def test_the_cycle_closes(self, results):
-        cycle = np.linalg.multi_dot([result.T_parent_child for result in results])
+        cycle = np.linalg.multi_dot(
+            [result.T_parent_child for result in results]
+        )
         assert np.linalg.norm(cycle[:3, 3]) < 0.020
         assert np.degrees(Rotation.from_matrix(cycle[:3, :3]).magnitude()) < 0.1
         assert abs(sum(result.time_offset_s for result in results)) < 0.002
@@ -71,10 +82,14 @@ class TestRoadVehicle:
     @pytest.mark.parametrize("bag", [1, 2, 3])
     def test_lidar_odometry(self, bag):
         recording = real_data.zxl19(bag, "LO")
-        result = calibrate(recording.parent, recording.child, time_offset="estimate")
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate"
+        )
         assert result.status is SolveStatus.UNOBSERVABLE
         assert result.unobservable() == ["z"]
-        assert rpy_deg(result.T_parent_child)[2] == pytest.approx(-90.78, abs=0.5)
+        assert rpy_deg(result.T_parent_child)[2] == pytest.approx(
+            -90.78, abs=0.5
+        )
         assert_allclose(result.T_parent_child[:2, 3], (0.002, 0.367), atol=0.04)
         assert abs(result.time_offset_s) < 0.09
 
@@ -100,7 +115,9 @@ class TestRoadVehicle:
         folder = real_data.data_folder() / "zxl19" / "raw_bag1"
         names = "bag1-novatel_data-inspvax.csv", "bag1-aft_mapped_to_init.csv"
         files = [(folder / name, FileOptions(format=AUTO)) for name in names]
-        streams = [reading.trajectory for reading in read_trajectory_files(files)]
+        streams = [
+            reading.trajectory for reading in read_trajectory_files(files)
+        ]
         result = calibrate(*streams, time_offset="estimate", method=method)
         assert result.unobservable() == ["z"]
         assert result.T_parent_child[2, 3] == pytest.approx(0.0, abs=0.03)
@@ -110,7 +127,10 @@ class TestRoadVehicle:
     def test_monocular_scale(self, bag, scale):
         recording = real_data.zxl19(bag, "VO")
         result = calibrate(
-            recording.parent, recording.child, time_offset="estimate", scale="auto"
+            recording.parent,
+            recording.child,
+            time_offset="estimate",
+            scale="auto",
         )
         assert result.scale == pytest.approx(scale, rel=0.01)
         assert 0 < result.scale_sigma < 0.01 * scale
@@ -125,7 +145,8 @@ class TestBoreas:
         in_plane = result.T_parent_child[:2, 3] - real_data.BOREAS_TRUTH[:2, 3]
         assert np.linalg.norm(in_plane) < 0.005
         assert (
-            abs(np.degrees(Rotation.from_matrix(error[:3, :3]).as_rotvec()[2])) < 0.05
+            abs(np.degrees(Rotation.from_matrix(error[:3, :3]).as_rotvec()[2]))
+            < 0.05
         )
         z = result.observability[2]
         assert (
@@ -143,7 +164,9 @@ class TestBoreas:
         error = np.linalg.inv(real_data.BOREAS_TRUTH) @ result.T_parent_child
         assert np.linalg.norm(error[:3, 3]) < 0.001
         assert (
-            np.degrees(np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec()))
+            np.degrees(
+                np.linalg.norm(Rotation.from_matrix(error[:3, :3]).as_rotvec())
+            )
             < 0.01
         )
 
@@ -162,10 +185,14 @@ class TestBoreas:
         lambda: real_data.kitti("short"),
     ],
 )
-def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(recording):
+def test_lengths_in_millimetres_are_noticed_whatever_carries_the_sensors(
+    recording,
+):
     parent = recording().parent
     # Coordinates of a map in millimetres are refused when they are read.
-    parent = Trajectory(parent.stamps_ns, np.linalg.inv(parent.poses[0]) @ parent.poses)
+    parent = Trajectory(
+        parent.stamps_ns, np.linalg.inv(parent.poses[0]) @ parent.poses
+    )
     assert check_lengths(parent, parent) == []
     in_mm = parent.scaled(1000.0)
     assert codes_of(check_lengths(in_mm, in_mm)) == ["lengths"]
@@ -181,18 +208,25 @@ class TestArms:
         assert [f.code for f in result.findings if f.severity == "error"] == []
 
     @pytest.mark.parametrize("interval_s", [0.2, 1.0, 5.0])
-    def test_a_fixed_camera_beside_an_arm_has_inverse_poses_by_right(self, interval_s):
+    def test_a_fixed_camera_beside_an_arm_has_inverse_poses_by_right(
+        self, interval_s
+    ):
         parent, child = (
-            as_trajectory(poses, 1 / interval_s) for poses in real_data.eye_to_hand()
+            as_trajectory(poses, 1 / interval_s)
+            for poses in real_data.eye_to_hand()
         )
         codes = {
-            f.code for f in calibrate(parent, child).findings if f.severity != "note"
+            f.code
+            for f in calibrate(parent, child).findings
+            if f.severity != "note"
         }
         assert codes <= {"inverse_both"}
 
     def test_the_axis_of_one_axis_motion_is_named(self):
         recording = real_data.robot_arm("sim")
-        result = calibrate(recording.parent, recording.child, time_offset="estimate")
+        result = calibrate(
+            recording.parent, recording.child, time_offset="estimate"
+        )
         assert result.unobservable() == ["x"]
         note = next(
             f
@@ -215,14 +249,25 @@ class TestArms:
             else real_data.robot_arm(name)
         )
         result = calibrate(
-            recording.parent, recording.child, time_offset="estimate", reference="B20"
+            recording.parent,
+            recording.child,
+            time_offset="estimate",
+            reference="B20",
         )
         translation = result.T_parent_child[:3, 3]
-        outside = np.maximum(np.maximum(low - translation, translation - high), 0.0)
+        outside = np.maximum(
+            np.maximum(low - translation, translation - high), 0.0
+        )
         assert outside.max() < 0.0035
-        assert (outside <= [1.5 * dof.sigma for dof in result.observability[:3]]).all()
+        assert (
+            outside <= [1.5 * dof.sigma for dof in result.observability[:3]]
+        ).all()
         if name == "primesense":
-            assert 0.005 - 2 * result.time_offset_sigma_s < result.time_offset_s < 0.030
+            assert (
+                0.005 - 2 * result.time_offset_sigma_s
+                < result.time_offset_s
+                < 0.030
+            )
 
 
 _AT_1_HZ = {
@@ -256,7 +301,8 @@ def test_fifty_seconds_of_a_farm_robot_are_not_forbidden(start_s):
     nav, velodyne = shrimp_sensors(real_data.data_folder())
     start_ns = int(velodyne.stamps_ns[0] + start_s * 1e9)
     pair = (
-        between(stream, start_ns, start_ns + 50 * 10**9) for stream in (nav, velodyne)
+        between(stream, start_ns, start_ns + 50 * 10**9)
+        for stream in (nav, velodyne)
     )
     assert calibrate(*pair).verdict is not Verdict.DO_NOT_USE
 
@@ -320,11 +366,16 @@ def test_faults_are_found_and_named():
     every = 1 if os.environ.get("HAND_EYE_CALIB_ALL_FAULTS") else 12
     table = fault_table(every)
     false_alarms = {
-        name: cells[CLEAN][1] for name, cells in table.items() if not cells[CLEAN][0]
+        name: cells[CLEAN][1]
+        for name, cells in table.items()
+        if not cells[CLEAN][0]
     }
     assert false_alarms == {}
     cells = [
-        cell for row in table.values() for fault, cell in row.items() if fault != CLEAN
+        cell
+        for row in table.values()
+        for fault, cell in row.items()
+        if fault != CLEAN
     ]
     assert len(cells) == (150 if every == 1 else 11)
     assert sum(right for right, _ in cells) / len(cells) >= LEAST_SHARE

@@ -31,7 +31,8 @@ def arms():
 def run(arms, capsys, command):
     """Exit code, document (None after an error) and what was written to stderr."""
     words = [
-        str(arms / word) if (arms / word).exists() else word for word in command.split()
+        str(arms / word) if (arms / word).exists() else word
+        for word in command.split()
     ]
     return calibrated(capsys, *words)
 
@@ -55,7 +56,12 @@ RIGHT = [
     ("own.npz", IN_HAND, "hand", "read as a camera on the hand"),
     ("eye_to.npz", BESIDE, "base", "read as a camera beside the robot"),
     ("q7w.npz", IN_HAND, "hand", "w x y z"),
-    ("robot_mm.npz", IN_HAND, "hand", "parent stream's lengths are millimetres"),
+    (
+        "robot_mm.npz",
+        IN_HAND,
+        "hand",
+        "parent stream's lengths are millimetres",
+    ),
     ("track_mm.npz", IN_HAND, "hand", "child stream's lengths are millimetres"),
     ("s_to_2.0.npz --scale estimate", BESIDE, "base", "read as a camera"),
     ("s_in_2.0.npz --scale estimate", IN_HAND, "hand", "read as a camera"),
@@ -68,8 +74,18 @@ RIGHT = [
         "",
     ),
     ("H.npy C.npy --order none --child-invert poses", IN_HAND, "parent", ""),
-    ("ur.csv camT.csv --order none", IN_HAND, "parent", "both hold inverse poses"),
-    ("inv_both.npz --parent-invert poses --child-invert poses", IN_HAND, "hand", ""),
+    (
+        "ur.csv camT.csv --order none",
+        IN_HAND,
+        "parent",
+        "both hold inverse poses",
+    ),
+    (
+        "inv_both.npz --parent-invert poses --child-invert poses",
+        IN_HAND,
+        "hand",
+        "",
+    ),
     ("inv_track.npz --child-invert poses", IN_HAND, "hand", ""),
 ]
 
@@ -100,11 +116,16 @@ def test_clean_samples_have_no_findings(arms, capsys, command):
     [
         ("shifted.npz", "moved down by 1 row"),
         ("inv_both.npz", "one side or both have inverse poses"),
-        ("robot_mm.npz --scale 1000", "the parent stream's lengths are millimetres"),
+        (
+            "robot_mm.npz --scale 1000",
+            "the parent stream's lengths are millimetres",
+        ),
         ("H.npy C.npy --order none", "one of the two files has inverse poses"),
     ],
 )
-def test_what_contradicts_is_refused_with_its_cause(arms, capsys, command, text):
+def test_what_contradicts_is_refused_with_its_cause(
+    arms, capsys, command, text
+):
     code, document, _ = run(arms, capsys, command)
     assert code == 3
     assert document["verdict"] == "DO_NOT_USE"
@@ -128,7 +149,9 @@ def test_what_cannot_be_read_is_one_line(arms, capsys, command, text):
 def test_both_readings_of_inverse_poses_are_stated(arms, capsys):
     _, document, _ = run(arms, capsys, "inv_track.npz")
     assert "read as a camera beside the robot" in told(document)
-    assert "parent_invert poses (robot), child_invert poses (target)" in told(document)
+    assert "parent_invert poses (robot), child_invert poses (target)" in told(
+        document
+    )
 
 
 def test_rotations_alone_have_no_position(arms, capsys):
@@ -139,8 +162,12 @@ def test_rotations_alone_have_no_position(arms, capsys):
     assert document["T_parent_child"]["translation"] == [None, None, None]
 
 
-@pytest.mark.parametrize("name", ["s_to_2.0.npz", "s_in_2.0.npz", "s_in_0.5.npz"])
-def test_a_target_of_another_size_is_refused_and_its_scale_named(arms, capsys, name):
+@pytest.mark.parametrize(
+    "name", ["s_to_2.0.npz", "s_in_2.0.npz", "s_in_0.5.npz"]
+)
+def test_a_target_of_another_size_is_refused_and_its_scale_named(
+    arms, capsys, name
+):
     code, document, _ = run(arms, capsys, name)
     assert code == 3
     assert "multiplied by" in document["findings"][0]["what"]

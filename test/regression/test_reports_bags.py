@@ -83,11 +83,15 @@ def test_a_killed_recording_has_all_its_messages(bag, capsys):
     code, document, _ = calibrated(capsys, bag("wal_db3"))
     assert (code, document["verdict"]) == (0, "USE")
     assert_near(document, matrix_of(TRUTH))
-    counts = [document["inputs"][stream]["messages"] for stream in ("parent", "child")]
+    counts = [
+        document["inputs"][stream]["messages"] for stream in ("parent", "child")
+    ]
     assert counts == [MESSAGES, MESSAGES]
 
 
-@pytest.mark.parametrize(("name", "n_null"), [("lost_null", 29), ("first_null", 5)])
+@pytest.mark.parametrize(
+    ("name", "n_null"), [("lost_null", 29), ("first_null", 5)]
+)
 def test_null_poses_are_left_out_and_counted(bag, capsys, name, n_null):
     code, document, _ = calibrated(capsys, bag(name))
     assert (code, document["verdict"]) == (0, "USE")
@@ -96,7 +100,9 @@ def test_null_poses_are_left_out_and_counted(bag, capsys, name, n_null):
     assert [text for text in document["warnings"] if text.startswith(sentence)]
 
 
-def test_header_stamps_of_0_are_said_and_receive_times_taken_if_asked(bag, capsys):
+def test_header_stamps_of_0_are_said_and_receive_times_taken_if_asked(
+    bag, capsys
+):
     path = bag("zero_stamp_child")
     code, document, err = calibrated(capsys, path)
     assert (code, document) == (1, None)
@@ -115,7 +121,8 @@ def test_clocks_of_two_epochs_are_estimated(bag, capsys):
     with PoseBag(path) as opened:
         table = opened.poses("/lidar/odometry", "/camera/odometry")
     first_ns = [
-        table.stamps_ns[table.streams == stream][0] for stream in ("parent", "child")
+        table.stamps_ns[table.streams == stream][0]
+        for stream in ("parent", "child")
     ]
     apart_s = (int(first_ns[0]) - int(first_ns[1])) * 1e-9
     assert abs(document["time_offset_s"] - apart_s) < 60.0

@@ -63,7 +63,9 @@ def test_the_truth_is_found(run_files, parent, child, truth):
     assert_is(document, truth)
 
 
-@pytest.mark.parametrize(("parent", "child", "truth", "offset_s"), RIGHT_WITH_OFFSET)
+@pytest.mark.parametrize(
+    ("parent", "child", "truth", "offset_s"), RIGHT_WITH_OFFSET
+)
 def test_the_truth_is_found_with_clocks_of_other_epochs(
     run_files, parent, child, truth, offset_s
 ):
@@ -90,7 +92,9 @@ def test_the_cause_is_one_line(run_files, parent, child, cause):
 
 def test_check_reads_both_streams_as_calibrate_does(capsys):
     folder = reports_folder("files")
-    assert main(["check", str(folder / "p.tum"), str(folder / "motive.csv")]) == 1
+    assert (
+        main(["check", str(folder / "p.tum"), str(folder / "motive.csv")]) == 1
+    )
     out = capsys.readouterr().out
     # Before the choice between both readings, the check proposed to invert both streams.
     assert out.startswith(

@@ -59,7 +59,8 @@ def comment_of(field):
         parts.append(f"One of {', '.join(meta['choices'])}.")
     if meta["within"]:
         parts.append(
-            f"{' to '.join(map(number, meta['within']))} {meta['unit']}".rstrip() + "."
+            f"{' to '.join(map(number, meta['within']))} {meta['unit']}".rstrip()
+            + "."
         )
     if meta["read_only"]:
         parts.append("Fixed once the node runs.")
@@ -74,7 +75,9 @@ def value_of(field):
     if isinstance(field.default, bool):
         return str(field.default).lower()
     return (
-        f'"{field.default}"' if isinstance(field.default, str) else repr(field.default)
+        f'"{field.default}"'
+        if isinstance(field.default, str)
+        else repr(field.default)
     )
 
 

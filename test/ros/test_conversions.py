@@ -62,7 +62,8 @@ def test_control_characters_do_not_reach_the_log():
 
 
 @pytest.mark.parametrize(
-    ("kind", "measures"), [(Imu, "rates"), (Imu, "rotations"), (NavSatFix, "positions")]
+    ("kind", "measures"),
+    [(Imu, "rates"), (Imu, "rotations"), (NavSatFix, "positions")],
 )
 def test_a_message_without_what_is_measured_is_refused(kind, measures):
     message = kind()
@@ -79,7 +80,10 @@ def test_a_message_without_what_is_measured_is_refused(kind, measures):
 
 def test_messages_carry_frames_stamp_and_transform():
     transform = conversions.to_transform(calibration(np.eye(6)))
-    assert (transform.header.frame_id, transform.child_frame_id) == ("lidar", "camera")
+    assert (transform.header.frame_id, transform.child_frame_id) == (
+        "lidar",
+        "camera",
+    )
     assert ns_of(transform.header.stamp) == 1_700_000_000_123_456_789
     pose = conversions.to_pose_with_covariance(calibration(np.eye(6)))
     assert pose.header == transform.header
@@ -100,14 +104,22 @@ def test_markers_draw_sensors_uncertainty_and_what_is_installed():
     sigmas_m = np.array([0.01, 0.02, 0.03])
     in_parent = np.diag([*sigmas_m**2, 1e-4, 1e-4, 1e-4])
     in_child = turned(se3.inverse(T_PARENT_CHILD)[:3, :3], in_parent)
-    installed = dict(zip(NAMES, (0.4, -0.3, 0.2, 0.0, 0.0, np.pi / 2), strict=True))
+    installed = dict(
+        zip(NAMES, (0.4, -0.3, 0.2, 0.0, 0.0, np.pi / 2), strict=True)
+    )
     comparison = Comparison(sentence="same", values=installed)
     message = to_markers(calibration(in_child, comparison=comparison))
     clear, *markers = message.markers
     assert clear.action == Marker.DELETEALL
     assert {marker.header.frame_id for marker in markers} == {"lidar"}
     by_name = {marker.ns: marker for marker in markers}
-    assert list(by_name) == ["parent", "child", "uncertainty", "text", "installed"]
+    assert list(by_name) == [
+        "parent",
+        "child",
+        "uncertainty",
+        "text",
+        "installed",
+    ]
     assert_allclose(pose_of(by_name["parent"]), np.eye(4), atol=1e-15)
     assert_allclose(pose_of(by_name["child"]), T_PARENT_CHILD, atol=1e-12)
     x_axis = pose_of(by_name["installed"])[:3, 0]
@@ -131,7 +143,11 @@ def test_the_ellipsoid_of_an_unobservable_axis_stays_in_the_scene():
         for marker in to_markers(calibration(9.0 * np.eye(6))).markers
         if marker.ns == "uncertainty"
     )
-    assert (ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z) == (2.0, 2.0, 2.0)
+    assert (ellipsoid.scale.x, ellipsoid.scale.y, ellipsoid.scale.z) == (
+        2.0,
+        2.0,
+        2.0,
+    )
 
 
 def pose_of(marker):

@@ -40,7 +40,8 @@ def run(*arguments, domain=0):
 
 def numbers(line):
     return [
-        float(word) for word in re.findall(r"(?<= )-?\d[\d.]*(?:e-?\d+)?(?= |$)", line)
+        float(word)
+        for word in re.findall(r"(?<= )-?\d[\d.]*(?:e-?\d+)?(?= |$)", line)
     ]
 
 
@@ -68,9 +69,16 @@ def test_demo_recovers_the_truth_offline_and_live_and_replaces_an_earlier_demo(
     assert max(numbers(apart)) < 1e-6
 
     # The replay command finds the same in the bag that is left behind.
-    topics = ["--parent-topic", TOPICS["parent"], "--child-topic", TOPICS["child"]]
+    topics = [
+        "--parent-topic",
+        TOPICS["parent"],
+        "--child-topic",
+        TOPICS["child"],
+    ]
     assert main(["replay", str(tmp_path / "demo_bag"), *topics, "--json"]) == 0
-    replayed = np.array(json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"])
+    replayed = np.array(
+        json.loads(capsys.readouterr().out)["T_parent_child"]["matrix"]
+    )
     assert numbers(offline)[:3] == pytest.approx(replayed[:3, 3], abs=1e-4)
     remaining = ["demo_bag", "mine.txt", "node.log", "report.html"]
     assert sorted(path.name for path in tmp_path.iterdir()) == remaining
@@ -92,15 +100,19 @@ def test_demo_without_ros_says_what_to_install_and_with_it_why_it_does_not_start
     assert not (tmp_path / "out").exists()
     bad = run("-m", "hand_eye_calib", *command, domain="one")
     assert "error: cannot start ROS: " in bad.stderr.splitlines()[-1]
-    assert "ROS_DOMAIN_ID is not an integral number" in bad.stderr.splitlines()[-1]
-    assert [(process.returncode, process.stdout) for process in (without, bad)] == [
-        (1, "")
-    ] * 2
+    assert (
+        "ROS_DOMAIN_ID is not an integral number" in bad.stderr.splitlines()[-1]
+    )
+    assert [
+        (process.returncode, process.stdout) for process in (without, bad)
+    ] == [(1, "")] * 2
 
 
 def test_player_does_not_wait_for_ever(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-    monkeypatch.setattr("hand_eye_calib.extras.simulation.player._PATIENCE_S", 0.1)
+    monkeypatch.setattr(
+        "hand_eye_calib.extras.simulation.player._PATIENCE_S", 0.1
+    )
     with pytest.raises(
         HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"
     ):

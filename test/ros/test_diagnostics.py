@@ -45,7 +45,8 @@ def state(peer):
 
         def met():
             return next(
-                (document for document in heard[start:] if condition(document)), None
+                (document for document in heard[start:] if condition(document)),
+                None,
             )
 
         peer.spin_until(lambda: meanwhile() or met(), description)
@@ -62,15 +63,24 @@ def test_nothing_is_ok_before_a_valid_result_and_the_inputs_that_are_missing_are
     first = state(lambda document: True)
     assert tuple(name for name, _ in first.parts()) == PARTS
     assert {status.level for _, status in first.parts()} == {Level.WARN}
-    assert first.inputs["parent"].text == "no message on /parent_odom yet: 0 publishers"
+    assert (
+        first.inputs["parent"].text
+        == "no message on /parent_odom yet: 0 publishers"
+    )
     peer.feed(peer.publishers(), *drive(8))  # too few
     # An input that delivers is no fault, whatever the result.
-    document = state(lambda document: document.inputs["parent"].text.endswith("Hz"))
+    document = state(
+        lambda document: document.inputs["parent"].text.endswith("Hz")
+    )
     assert document.inputs["parent"].level is Level.OK
     state(
-        lambda document: "synchronised pose pairs are needed" in document.extrinsic.text
+        lambda document: (
+            "synchronised pose pairs are needed" in document.extrinsic.text
+        )
     )
-    assert Level.OK not in {document.extrinsic.level for document in state.heard}
+    assert Level.OK not in {
+        document.extrinsic.level for document in state.heard
+    }
 
 
 def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
@@ -80,15 +90,21 @@ def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     states = []
     topic = "/robot1/calibrator/progress"
     peer.node.create_subscription(String, topic, states.append, LATCHED)
-    peer.spin_until(lambda: states and len(statuses) == 2 * len(PARTS), "both nodes")
+    peer.spin_until(
+        lambda: states and len(statuses) == 2 * len(PARTS), "both nodes"
+    )
     names = [
-        f"{node}: {name}" for node in ("/robot1/calibrator", "/other") for name in PARTS
+        f"{node}: {name}"
+        for node in ("/robot1/calibrator", "/other")
+        for name in PARTS
     ]
     assert set(statuses) == set(names)
     progress = statuses["/robot1/calibrator: progress"]
     document = json.loads(states[-1].data)
     assert progress.message == document["headline"]
-    assert progress.message.startswith("CHECK INPUT: No message on /robot1/parent_odom")
+    assert progress.message.startswith(
+        "CHECK INPUT: No message on /robot1/parent_odom"
+    )
     values = values_of(progress)
     assert (progress.level, progress.hardware_id) == (
         DiagnosticStatus.WARN,
@@ -98,9 +114,13 @@ def test_diagnostics_have_the_same_and_tell_two_nodes_apart(start_node, peer):
     assert (values["done"], *z) == ("false", "unknown", "0.03")
 
 
-def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_path):
+def test_a_good_drive_is_ok_with_all_its_figures(
+    start_node, peer, state, tmp_path
+):
     start_node(
-        "-p solve_period:=0.5", f"-p output_directory:={tmp_path}", *RELIABLE_INPUTS
+        "-p solve_period:=0.5",
+        f"-p output_directory:={tmp_path}",
+        *RELIABLE_INPUTS,
     )
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = drive()
@@ -116,21 +136,28 @@ def test_a_good_drive_is_ok_with_all_its_figures(start_node, peer, state, tmp_pa
             publisher.publish(
                 message(publisher.msg_type, int(stamp_ns) - late_ns, T, frame)
             )
-    sentence = "the streams do not overlap in time (120 parent and 120 child poses"
+    sentence = (
+        "the streams do not overlap in time (120 parent and 120 child poses"
+    )
     # A solve may come before.
-    apart = state(lambda document: sentence in document.extrinsic.text).extrinsic
+    apart = state(
+        lambda document: sentence in document.extrinsic.text
+    ).extrinsic
     assert (apart.level, "set time_offset" in apart.text) == (Level.WARN, True)
     assert peer.set_parameter("time_offset", 20.0).successful
     good = state(
         lambda document: (
-            document.extrinsic.level is Level.OK and document.extrinsic.n_poses == 120
+            document.extrinsic.level is Level.OK
+            and document.extrinsic.n_poses == 120
         )
     )
     assert good.extrinsic.text.startswith("USE: good to ")
     assert all(angle > 20 for angle in good.extrinsic.rotation_deg.values())
     result = good.extrinsic.result
     assert result.status == "ok"
-    assert all(0.001 < result.pose_sigma[axis] < 0.01 for axis in "xyz")  # the floor
+    assert all(
+        0.001 < result.pose_sigma[axis] < 0.01 for axis in "xyz"
+    )  # the floor
     assert 0 <= result.age_s < 60
     assert (good.journal.level, good.journal.directory) == (
         Level.OK,
@@ -145,7 +172,9 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
     peer.feed(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
     state(lambda document: document.extrinsic.level is Level.OK)
     # Both silent with a result: the robot is parked. One of them: something is broken.
-    silent = state(lambda document: "silent for" in document.inputs["child"].text)
+    silent = state(
+        lambda document: "silent for" in document.inputs["child"].text
+    )
     assert silent.inputs["child"].level is Level.OK
 
     later_ns = itertools.count(int(stamps_ns[-1]), 10**8)
@@ -183,7 +212,9 @@ def test_bad_input_is_an_error_by_topic_and_reason(start_node, peer, state):
             message(publishers[0].msg_type, stamp_ns, Ts_pw_p[0], "lidar")
         )
     newest = state(
-        lambda document: document.inputs["parent"].refused.get("corrupt stamp") == 1
+        lambda document: (
+            document.inputs["parent"].refused.get("corrupt stamp") == 1
+        )
     )
     assert newest.inputs["parent"].level is Level.ERROR
 
@@ -198,7 +229,9 @@ def test_repeated_stamps_gaps_and_rates_are_counted_and_disabled_is_said(
     peer.feed(publishers, stamps_ns[kept], Ts_pw_p[kept], Ts_cw_c[kept])
     peer.feed(publishers, stamps_ns[55:60], Ts_pw_p[55:60], Ts_cw_c[55:60])
     parent = state(
-        lambda document: document.inputs["parent"].refused["repeated stamp"] == 5
+        lambda document: (
+            document.inputs["parent"].refused["repeated stamp"] == 5
+        )
     )
     parent = parent.inputs["parent"]
     assert (parent.messages, parent.poses_taken) == (55, 50)
@@ -221,7 +254,10 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
     def both_go_on():
         stamp_ns = next(later_ns)
         newest = zip(
-            publishers, (Ts_pw_p[-1], Ts_cw_c[-1]), ("lidar", "camera"), strict=True
+            publishers,
+            (Ts_pw_p[-1], Ts_cw_c[-1]),
+            ("lidar", "camera"),
+            strict=True,
         )
         for publisher, T, frame in newest:
             publisher.publish(message(publisher.msg_type, stamp_ns, T, frame))
@@ -236,23 +272,28 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
     def has_two_publishers(document):
         return document.inputs["child"].publishers == 2
 
-    child = state(has_two_publishers, "the second publisher", both_go_on).inputs[
-        "child"
-    ]
+    child = state(
+        has_two_publishers, "the second publisher", both_go_on
+    ).inputs["child"]
     assert child.level is Level.WARN
     assert (
-        "/child_odom has 2 publishers, all named /peer. Stop all but one" in child.text
+        "/child_odom has 2 publishers, all named /peer. Stop all but one"
+        in child.text
     )
     for publisher in (publishers[1], second):
         peer.node.destroy_publisher(publisher)
 
     def only_the_parent_goes_on():
-        made = message(publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar")
+        made = message(
+            publishers[0].msg_type, next(later_ns), Ts_pw_p[-1], "lidar"
+        )
         publishers[0].publish(made)
 
     def is_paused(document):
         # A check of the streams may come at any time, and its finding is a graver text.
-        return document.progress.is_paused and document.inputs["child"].is_paused
+        return (
+            document.progress.is_paused and document.inputs["child"].is_paused
+        )
 
     child = state(is_paused, "the pause", only_the_parent_goes_on)
     assert child.progress.is_paused
@@ -271,11 +312,15 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
 def test_too_little_driving_is_said_also_where_time_does_not_run(
     start_node, peer, state
 ):
-    start_node("-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS)
+    start_node(
+        "-p use_sim_time:=true", "-p solve_period:=0.2", *RELIABLE_INPUTS
+    )
     peer.feed(peer.publishers(), *drive())
     newest = state(lambda document: document.extrinsic.result)
     assert (newest.checks.level, newest.checks.age_s) == (Level.WARN, None)
-    sentence = "not checked yet: that takes 20 s of motion with rotations of 30 deg"
+    sentence = (
+        "not checked yet: that takes 20 s of motion with rotations of 30 deg"
+    )
     assert newest.checks.text == sentence
 
 
@@ -332,7 +377,11 @@ class TestStreamChecks:
         stamps_ns, Ts_pw_p, Ts_cw_c = drive(250, sigma_rad=7e-4)
         Ts_cw_c[:, :3, 3] *= 1000.0
         peer.feed(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
-        state(lambda document: document.checks.text.endswith(": set scale to 0.001"))
+        state(
+            lambda document: document.checks.text.endswith(
+                ": set scale to 0.001"
+            )
+        )
         assert peer.trigger("save").success
         assert load_result(tmp_path).headline.startswith(
             "DO NOT USE: the child's lengths must be"
@@ -350,7 +399,9 @@ class TestStreamChecks:
 
     def test_sound_streams_raise_nothing(self, start_node, peer, state):
         # A solve of the first few poses may say what they do not determine.
-        node = start_node("-p solve_period:=0.5", "-p min_pairs:=240", *RELIABLE_INPUTS)
+        node = start_node(
+            "-p solve_period:=0.5", "-p min_pairs:=240", *RELIABLE_INPUTS
+        )
         peer.feed(peer.publishers(), *drive(250, sigma_rad=7e-4))
         newest = state(lambda document: document.checks.level is Level.OK)
         assert not [
@@ -360,4 +411,6 @@ class TestStreamChecks:
         ]
         warnings = [line for line in node.log.splitlines() if "[WARN]" in line]
         # Other programs may keep the computer busy.
-        assert not [line for line in warnings if "The computer is busy" not in line]
+        assert not [
+            line for line in warnings if "The computer is busy" not in line
+        ]

@@ -30,7 +30,9 @@ from hand_eye_calib.online.ros import conversions
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
 
 
-def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, peer):
+def test_unusable_messages_are_refused_by_topic_and_poison_nothing(
+    start_node, peer
+):
     node = start_node(*QUIET, "--log-level calibrator:=debug")
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
@@ -45,13 +47,18 @@ def test_unusable_messages_are_refused_by_topic_and_poison_nothing(start_node, p
     long.pose.pose.orientation.w += 1.0
     for index, wrong in ((0, nan), (0, far), (1, long)):
         publishers[index].publish(wrong)
-    refused = [f"/{name}_odom: a message is refused: " for name in ("parent", "child")]
+    refused = [
+        f"/{name}_odom: a message is refused: " for name in ("parent", "child")
+    ]
     _, extrinsic = peer.solve(publishers, stamps_ns, Ts_pw_p, Ts_cw_c)
-    publishers[0].publish(message(Odometry, stamps_ns[-1], Ts_pw_p[-1], "lidar"))
+    publishers[0].publish(
+        message(Odometry, stamps_ns[-1], Ts_pw_p[-1], "lidar")
+    )
     log = node.wait_for_log(*refused, "is repeated or too late")
     assert len(re.findall(r"message with stamp .* refused: ", log)) == 2, log
     assert (
-        len(re.findall(r"message with stamp .* is left out: .*not finite", log)) == 1
+        len(re.findall(r"message with stamp .* is left out: .*not finite", log))
+        == 1
     ), log
     assert "Traceback" not in log
     assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
@@ -88,7 +95,9 @@ def test_bag_that_loops_starts_a_new_session(start_node, peer):
 
     def right():
         peer.trigger("solve")
-        return heard and np.allclose(matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3)
+        return heard and np.allclose(
+            matrix(heard[-1]), T_PARENT_CHILD, atol=1e-3
+        )
 
     peer.spin_until(right, "the second lap's extrinsic")
     assert "poses, " in peer.trigger("solve").message
@@ -106,19 +115,24 @@ def test_solves_at_once_have_answers_and_a_reset_forgets_poses_and_result(
     assert answer.success
     assert "camera in lidar: xyz = (" in answer.message
     answers = [peer.ask(Trigger, "solve") for _ in range(5)]
-    peer.spin_until(lambda: all(answer.done() for answer in answers), "all answers")
+    peer.spin_until(
+        lambda: all(answer.done() for answer in answers), "all answers"
+    )
     assert all(answer.result().success for answer in answers)
     assert peer.trigger("reset").success
     late = peer.listen(TransformStamped, "extrinsic")
     peer.spin_until(
-        lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1, "one topic"
+        lambda: peer.node.count_publishers("/calibrator/extrinsic") == 1,
+        "one topic",
     )
     time.sleep(0.5)  # what is not to come has no event
     assert not peer.trigger("solve").success
     assert not late
 
 
-def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(start_node, peer):
+def test_result_of_a_session_that_was_reset_meanwhile_is_dropped(
+    start_node, peer
+):
     node = start_node(*QUIET)
     peer.solve(peer.publishers(), *drive())
     heard = peer.listen(TransformStamped, "extrinsic")
@@ -160,7 +174,9 @@ def test_best_effort_publishers_of_a_remapped_topic_are_counted_heard_and_named(
 ):
     """Whatever QoS the other input has."""
     node = start_node(
-        "-p solve_period:=0.1", "-r parent_odom:=/lidar/odom", RELIABLE_INPUTS[1]
+        "-p solve_period:=0.1",
+        "-r parent_odom:=/lidar/odom",
+        RELIABLE_INPUTS[1],
     )
     child = peer.publisher(Odometry, "child_odom")
     peer.wait_matched(child)  # its override comes first
@@ -186,7 +202,9 @@ def test_a_qos_that_keeps_messages_away_is_named(start_node, peer):
 class TestRefusedInput:
     """What an input carries cannot be used: that is said, and ends nothing."""
 
-    def test_a_type_that_does_not_measure_what_was_asked_for(self, start_node, peer):
+    def test_a_type_that_does_not_measure_what_was_asked_for(
+        self, start_node, peer
+    ):
         node = start_node(QUIET[0], "-p child_measures:=rates")
         wrong = peer.publisher(PoseStamped, "child_odom")
         node.wait_for_log(
@@ -201,7 +219,9 @@ class TestRefusedInput:
     def test_positions_where_the_mount_is_watched(self, start_node, peer):
         node = start_node("-p monitor:=true", "-p installed:=1 0 0 0 0 0")
         peer.publisher(NavSatFix, "child_odom")
-        node.wait_for_log("a rig and the monitor need poses; child has positions")
+        node.wait_for_log(
+            "a rig and the monitor need poses; child has positions"
+        )
         peer.wait_matched(peer.publisher(Odometry, "parent_odom"))
 
     def test_positions_on_both_inputs(self, start_node, peer):
@@ -220,7 +240,10 @@ class TestRefusedInput:
         ("arguments", "text"),
         [
             (
-                ["child_measures:=rates", "child_type:=geometry_msgs/msg/PoseStamped"],
+                [
+                    "child_measures:=rates",
+                    "child_type:=geometry_msgs/msg/PoseStamped",
+                ],
                 "/child_odom has messages of type geometry_msgs/msg/PoseStamped, which measure",
             ),
             (
@@ -243,7 +266,10 @@ class TestRefusedInput:
                 ["journal:=resume"],
                 "journal resume needs output_directory: set the session",
             ),
-            (["output_directory:=~nosuchuser/x"], "output_directory '~nosuchuser/x'"),
+            (
+                ["output_directory:=~nosuchuser/x"],
+                "output_directory '~nosuchuser/x'",
+            ),
         ],
     )
     def test_parameters_that_cannot_go_together_end_the_start_in_one_line(
@@ -260,14 +286,17 @@ class TestLoss:
 
     def test_a_node_that_does_not_keep_up(self, start_node, peer):
         statuses = peer.diagnostics()
-        node = start_node("-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom")
+        node = start_node(
+            "-p solve_period:=1000.0", "-r parent_odom:=/lidar/odom"
+        )
         qos = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics = "/lidar/odom", "child_odom"
         publishers = [
             peer.node.create_publisher(Odometry, topic, qos) for topic in topics
         ]
         made = [
-            message(Odometry, START_NS, stream[0], "lidar") for stream in drive(1)[1:]
+            message(Odometry, START_NS, stream[0], "lidar")
+            for stream in drive(1)[1:]
         ]
         n_sent = 0
         calls = itertools.count()
@@ -293,21 +322,26 @@ class TestLoss:
                 for name, status in statuses.items()
                 if name.endswith(" input")
             ]
-            if len(values) < 2 or any(row["lost"] == "unknown" for row in values):
+            if len(values) < 2 or any(
+                row["lost"] == "unknown" for row in values
+            ):
                 return []
-            return [[int(row[key]) for key in ("messages", "lost")] for row in values]
+            return [
+                [int(row[key]) for key in ("messages", "lost")]
+                for row in values
+            ]
 
         peer.spin_until(told, "both inputs to receive")
-        n_before = (
-            n_sent  # of these, an unknown number went out before the subscriptions
-        )
+        n_before = n_sent  # of these, an unknown number went out before the subscriptions
         node.process.send_signal(signal.SIGSTOP)
         send(3800)
         node.process.send_signal(signal.SIGCONT)
         peer.spin_until(
             lambda: all(
                 lost >= 500
-                and -n_before - 0.02 * lost <= received + lost - n_sent <= 0.02 * lost
+                and -n_before - 0.02 * lost
+                <= received + lost - n_sent
+                <= 0.02 * lost
                 for received, lost in told() or [(0, 0)]
             ),
             "all messages to be received or lost",

@@ -24,7 +24,10 @@ from hand_eye_calib.online.ros.tf import STATIC_TOPIC, Robot, RobotTree
 
 NUMBERS = " ".join(
     f"{value:.9f}"
-    for value in (*T_PARENT_CHILD[:3, 3], *se3.rotation_to_rpy(T_PARENT_CHILD[:3, :3]))
+    for value in (
+        *T_PARENT_CHILD[:3, 3],
+        *se3.rotation_to_rpy(T_PARENT_CHILD[:3, :3]),
+    )
 )
 
 
@@ -36,7 +39,8 @@ def status(peer):
     def wait(name, condition):
         name = f"/calibrator: {name}"
         peer.spin_until(
-            lambda: name in statuses and condition(statuses[name]), f"such a {name}"
+            lambda: name in statuses and condition(statuses[name]),
+            f"such a {name}",
         )
         return statuses[name], values_of(statuses[name])
 
@@ -68,8 +72,12 @@ def test_a_result_is_compared_with_what_is_installed(
         )
 
     _, values = status("progress", is_told)
-    assert float(values["comparison.difference.z"]) == pytest.approx(-0.2, abs=0.02)
-    assert float(values["comparison.values.z"]) == pytest.approx(float(moved[2]))
+    assert float(values["comparison.difference.z"]) == pytest.approx(
+        -0.2, abs=0.02
+    )
+    assert float(values["comparison.values.z"]) == pytest.approx(
+        float(moved[2])
+    )
     assert float(values["comparison.sigma.z"]) > 0
     assert peer.trigger("save").success
     saved = load_result(tmp_path)
@@ -87,7 +95,9 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     publishers = peer.publishers()
     stamps_ns, Ts_pw_p, Ts_cw_c = noisy(*drive(2600))
     peer.feed(publishers, stamps_ns[:1800], Ts_pw_p[:1800], Ts_cw_c[:1800])
-    quiet, values = status("mount", lambda status: "has not moved" in status.message)
+    quiet, values = status(
+        "mount", lambda status: "has not moved" in status.message
+    )
     assert quiet.level == DiagnosticStatus.OK
     assert all(
         float(values[f"visible_10min.{axis}"]) < 0.02
@@ -112,13 +122,17 @@ def test_the_monitor_learns_then_is_quiet_and_raises_an_alarm_when_the_mount_mov
     assert "the mount has moved" in read_digest(digest).alarm
     assert peer.trigger("reset").success
     peer.feed(publishers, stamps_ns[2400:], Ts_pw_p[2400:], Ts_cw_c[2400:])
-    again, _ = status("mount", lambda status: "learning the noise" in status.message)
+    again, _ = status(
+        "mount", lambda status: "learning the noise" in status.message
+    )
     assert again.level == DiagnosticStatus.OK
     assert "extrinsic" not in node.log
     assert not (tmp_path / "journal").exists()
 
 
-def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(start_node):
+def test_a_wrong_path_to_what_is_installed_ends_the_start_in_one_line(
+    start_node,
+):
     node = start_node("-p monitor:=true", "-p installed:=robot.urdf")
     assert node.wait() == 1
     assert node.log == (
@@ -135,13 +149,16 @@ def test_frames_that_are_not_in_what_is_installed_are_said(
         '<parent link="base"/><child link="lidar"/></joint></robot>'
     )
     start_node(
-        "-p monitor:=true", f"-p installed:={tmp_path / 'robot.urdf'}", *RELIABLE_INPUTS
+        "-p monitor:=true",
+        f"-p installed:={tmp_path / 'robot.urdf'}",
+        *RELIABLE_INPUTS,
     )
     early, _ = status("mount", lambda status: True)
     assert early.message == "no poses yet"
     peer.feed(peer.publishers(), *drive(100))
     mount, _ = status(
-        "mount", lambda status: "the installed transform is unknown" in status.message
+        "mount",
+        lambda status: "the installed transform is unknown" in status.message,
     )
     assert mount.level == DiagnosticStatus.WARN
     assert "no frame 'camera'" in mount.message
@@ -161,7 +178,9 @@ def edge(parent, child, T):
     place = message.transform.translation
     rotation = message.transform.rotation
     place.x, place.y, place.z = T[:3, 3].tolist()
-    rotation.x, rotation.y, rotation.z, rotation.w = se3.to_quat_xyzw(T).tolist()
+    rotation.x, rotation.y, rotation.z, rotation.w = se3.to_quat_xyzw(
+        T
+    ).tolist()
     return message
 
 
@@ -198,8 +217,12 @@ def test_the_base_frame_comes_from_tf(monkeypatch):
     heard = Heard(monkeypatch, base_frame="base_link")
     early = heard.robot.complete(result())
     assert early.base_frame == ""
-    assert "base_frame base_link is not known from /tf_static" in heard.lines[-1]
-    heard.hear(edge("base_link", "mast", LIDAR), edge("mast", "lidar", np.eye(4)))
+    assert (
+        "base_frame base_link is not known from /tf_static" in heard.lines[-1]
+    )
+    heard.hear(
+        edge("base_link", "mast", LIDAR), edge("mast", "lidar", np.eye(4))
+    )
     mounting = heard.robot.complete(result())
     assert_allclose(mounting.T_base_child, LIDAR @ X, atol=1e-12)
     broadcast = to_transform(mounting, is_mounting=True)
@@ -210,7 +233,9 @@ def test_the_base_frame_comes_from_tf(monkeypatch):
     assert broadcast.transform.translation.x == pytest.approx((LIDAR @ X)[0, 3])
 
 
-def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(monkeypatch):
+def test_what_is_installed_comes_from_tf_but_not_from_the_node_itself(
+    monkeypatch,
+):
     heard = Heard(monkeypatch, installed="tf")
     own = edge("base_link", "camera", np.eye(4))
     heard.own.append(own)
@@ -233,7 +258,9 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(
     R = known_pose.T_parent_child[:3, :3]
     covariance[:3, :3] += 9.0 * np.outer(R[2], R[2])
     hidden = dataclasses.replace(
-        known_pose, observability_measured=tuple(dofs), covariance_measured=covariance
+        known_pose,
+        observability_measured=tuple(dofs),
+        covariance_measured=covariance,
     )
     heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
     T = heard.robot.complete(hidden).T_parent_child
@@ -244,7 +271,8 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(
         in heard.robot.complete(hidden).warnings[-1]
     )
     assert_array_equal(
-        heard.robot.complete(known_pose).T_parent_child, known_pose.T_parent_child
+        heard.robot.complete(known_pose).T_parent_child,
+        known_pose.T_parent_child,
     )
 
 
@@ -252,7 +280,9 @@ def test_an_unusable_transform_is_said(monkeypatch):
     heard = Heard(monkeypatch, base_frame="base_link")
     bad = edge("base_link", "lidar", LIDAR)
     bad.transform.rotation.w = 0.0
-    bad.transform.rotation.x = bad.transform.rotation.y = bad.transform.rotation.z = 0.0
+    bad.transform.rotation.x = bad.transform.rotation.y = (
+        bad.transform.rotation.z
+    ) = 0.0
     heard.hear(bad)
     assert "unusable transform of lidar" in heard.lines[-1]
     assert heard.robot.complete(result()).base_frame == ""

@@ -9,7 +9,11 @@ from geometry_msgs.msg import TransformStamped
 from numpy.testing import assert_allclose
 from ros_harness import RELIABLE_INPUTS, T_PARENT_CHILD, drive, matrix
 
-from hand_eye_calib.formats.journal import count_poses, has_session, read_journal
+from hand_eye_calib.formats.journal import (
+    count_poses,
+    has_session,
+    read_journal,
+)
 from hand_eye_calib.formats.results import load_result
 
 QUIET = ["-p solve_period:=1000.0", *RELIABLE_INPUTS]
@@ -37,7 +41,9 @@ def test_a_killed_session_goes_on_where_it_ended(start_node, peer, tmp_path):
     node.wait()
 
     again = start_node(*QUIET, *into(tmp_path, "resume"))
-    again.wait_for_log(f"session resumed from {tmp_path / 'journal'}: 120 poses")
+    again.wait_for_log(
+        f"session resumed from {tmp_path / 'journal'}: 120 poses"
+    )
     heard = peer.listen(TransformStamped, "extrinsic")
     answer = peer.trigger("solve")
     assert "60 poses" in answer.message
@@ -121,12 +127,18 @@ def test_a_disk_that_is_full_is_reported_and_the_node_goes_on(
     resource.prlimit(
         node.process.pid, resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY)
     )
-    answer, _ = peer.solve(publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:])
+    answer, _ = peer.solve(
+        publishers, stamps_ns[40:], Ts_pw_p[40:], Ts_cw_c[40:]
+    )
     assert answer.success
-    peer.spin_until(lambda: not peer.trigger("save").success, "the save to fail")
+    peer.spin_until(
+        lambda: not peer.trigger("save").success, "the save to fail"
+    )
     assert fingerprints(tmp_path / "out") == saved
     node.wait_for_log(
-        "cannot write the session journal in", "no journal until ~/reset", "cannot save"
+        "cannot write the session journal in",
+        "no journal until ~/reset",
+        "cannot save",
     )
     resource.prlimit(
         node.process.pid,
@@ -151,7 +163,8 @@ def test_a_directory_that_cannot_be_made_is_reported_and_the_node_goes_on(
     name = "/calibrator: journal"
     error = "a crash would lose the session"
     peer.spin_until(
-        lambda: name in statuses and error in statuses[name].message, "the status"
+        lambda: name in statuses and error in statuses[name].message,
+        "the status",
     )
     assert statuses[name].level == DiagnosticStatus.ERROR
     refused = peer.trigger("save")
@@ -192,12 +205,22 @@ def test_participants_choose_a_directory_below_that_of_the_start_only(
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "link").symlink_to(tmp_path / "elsewhere")
     start_node(*QUIET, *into(tmp_path / "mine"))
-    for outside in ("elsewhere", "mine/../elsewhere", "mine/link", "mine/link/below"):
-        refused = peer.set_parameter("output_directory", str(tmp_path / outside))
+    for outside in (
+        "elsewhere",
+        "mine/../elsewhere",
+        "mine/link",
+        "mine/link/below",
+    ):
+        refused = peer.set_parameter(
+            "output_directory", str(tmp_path / outside)
+        )
         assert not refused.successful, outside
         assert f"must be {tmp_path / 'mine'} or below it" in refused.reason
     refused = peer.set_parameter("output_directory", "~nosuchuser/x")
-    assert (refused.successful, "~nosuchuser/x" in refused.reason) == (False, True)
+    assert (refused.successful, "~nosuchuser/x" in refused.reason) == (
+        False,
+        True,
+    )
     assert peer.parameter("output_directory") == str(tmp_path / "mine")
     assert peer.set_parameter(
         "output_directory", str(tmp_path / "mine" / "truck")
@@ -215,6 +238,8 @@ def test_an_earlier_result_is_kept_once_and_replaced_whatever_it_is(
         assert peer.trigger("save").success
     assert node.stop()[0] == 0
     assert (
-        (tmp_path / "previous" / "extrinsic.yaml").read_bytes().startswith(b"\xff\xfe")
+        (tmp_path / "previous" / "extrinsic.yaml")
+        .read_bytes()
+        .startswith(b"\xff\xfe")
     )
     assert load_result(tmp_path).n_poses == 120

@@ -21,7 +21,11 @@ from ros_harness import (
 from sensor_msgs.msg import Imu, NavSatFix
 
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.formats.journal import count_poses, has_session, read_journal
+from hand_eye_calib.formats.journal import (
+    count_poses,
+    has_session,
+    read_journal,
+)
 from hand_eye_calib.online.ros import conversions
 
 ORIGIN = (60.0, 25.0, 40.0)
@@ -39,9 +43,15 @@ def fixes(stamps_ns, positions):
         yield fix
 
 
-def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tmp_path):
+def test_an_antenna_as_child_and_its_origin_after_a_restart(
+    start_node, peer, tmp_path
+):
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(160)
-    rows = [*zip(stamps_ns, Ts_pw_p, fixes(stamps_ns, Ts_cw_c[:, :3, 3]), strict=True)]
+    rows = [
+        *zip(
+            stamps_ns, Ts_pw_p, fixes(stamps_ns, Ts_cw_c[:, :3, 3]), strict=True
+        )
+    ]
     publishers = peer.publishers(Odometry, NavSatFix)
 
     def feed(chunk):
@@ -59,13 +69,16 @@ def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tm
     feed(rows[:80])
     journal = tmp_path / "journal"
     peer.spin_until(
-        lambda: has_session(journal) and count_poses(journal) == 156, "the journal"
+        lambda: has_session(journal) and count_poses(journal) == 156,
+        "the journal",
     )
     peer.spin_until(
         lambda: "origin" in read_journal(journal).about["child"], "the origin"
     )
     origin = read_journal(journal).about["child"]["origin"]
-    assert_allclose(np.degrees(origin[:2]), [rows[0][2].latitude, rows[0][2].longitude])
+    assert_allclose(
+        np.degrees(origin[:2]), [rows[0][2].latitude, rows[0][2].longitude]
+    )
     node.process.kill()
     node.wait()
     peer.wait_left(*publishers)
@@ -73,7 +86,9 @@ def test_an_antenna_as_child_and_its_origin_after_a_restart(start_node, peer, tm
     node = start_node(*options, "-p journal:=resume")
     node.wait_for_log("session resumed")
     feed(rows[80:])
-    peer.spin_until(lambda: count_poses(journal) == 312, "all poses in the journal")
+    peer.spin_until(
+        lambda: count_poses(journal) == 312, "all poses in the journal"
+    )
     transforms = peer.listen(TransformStamped, "extrinsic")
     assert peer.trigger("solve").success
     peer.spin_until(lambda: transforms, "the lever arm")
@@ -91,8 +106,12 @@ def imu_messages(stamps_ns, Ts_cw_c):
         np.swapaxes(Ts_cw_c[:-1, :3, :3], 1, 2) @ Ts_cw_c[1:, :3, :3]
     )
     rates = steps / (np.diff(stamps_ns)[:, None] * 1e-9)
-    rates = np.concatenate([rates[:1], 0.5 * (rates[1:] + rates[:-1]), rates[-1:]])
-    for stamp_ns, (x, y, z) in zip(stamps_ns.tolist(), rates.tolist(), strict=True):
+    rates = np.concatenate(
+        [rates[:1], 0.5 * (rates[1:] + rates[:-1]), rates[-1:]]
+    )
+    for stamp_ns, (x, y, z) in zip(
+        stamps_ns.tolist(), rates.tolist(), strict=True
+    ):
         imu = Imu()
         imu.header.stamp = conversions.to_time(stamp_ns)
         imu.header.frame_id = "imu_link"
@@ -106,7 +125,9 @@ def test_an_imu_as_child(start_node, peer):
     node = start_node("-p solve_period:=0.5", *RELIABLE_INPUTS)
     publishers = peer.publishers(Odometry, Imu)
     peer.wait_matched(*publishers)
-    stamps_ns, Ts_pw_p, Ts_cw_c = drive(300)  # long enough for the stream checks
+    stamps_ns, Ts_pw_p, Ts_cw_c = drive(
+        300
+    )  # long enough for the stream checks
     for stamp_ns, T, imu in zip(
         stamps_ns, Ts_pw_p, imu_messages(stamps_ns, Ts_cw_c), strict=True
     ):
@@ -117,15 +138,17 @@ def test_an_imu_as_child(start_node, peer):
         PoseWithCovarianceStamped, "extrinsic_with_covariance"
     )
     peer.spin_until(
-        lambda: transforms and ns_of(transforms[-1].header.stamp) >= stamps_ns[-2],
+        lambda: (
+            transforms and ns_of(transforms[-1].header.stamp) >= stamps_ns[-2]
+        ),
         "a result with the last poses",
     )
     assert transforms[-1].child_frame_id == "imu_link"
     T = matrix(transforms[-1])
     assert T[:3, 3].tolist() == [0.0, 0.0, 0.0]
-    assert float(se3.rotation_angle(T[:3, :3].T @ T_PARENT_CHILD[:3, :3])) < np.radians(
-        3.0
-    )
+    assert float(
+        se3.rotation_angle(T[:3, :3].T @ T_PARENT_CHILD[:3, :3])
+    ) < np.radians(3.0)
     peer.spin_until(lambda: with_covariance, "the pose with covariance")
     assert with_covariance[-1].pose.covariance[0] > 1.0
     assert "DO NOT USE" not in peer.trigger("solve").message
@@ -147,7 +170,9 @@ def edge(stamp_ns, parent, child, T_parent_child):
     return made
 
 
-def test_a_parent_that_is_only_in_tf_gives_what_its_topic_would(start_node, peer, kind):
+def test_a_parent_that_is_only_in_tf_gives_what_its_topic_would(
+    start_node, peer, kind
+):
     node = start_node(
         "-p parent_tf:=odom:lidar", "-p solve_period:=0.2", RELIABLE_INPUTS[1]
     )
@@ -159,11 +184,15 @@ def test_a_parent_that_is_only_in_tf_gives_what_its_topic_would(start_node, peer
     node.wait_for_log("against transform odom:lidar", "base:lidar (static)")
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     stamps_ns, Ts_pw_p, Ts_cw_c = drive(100)
-    for stamp_ns, T_odom_lidar, T_cw_c in zip(stamps_ns, Ts_pw_p, Ts_cw_c, strict=True):
+    for stamp_ns, T_odom_lidar, T_cw_c in zip(
+        stamps_ns, Ts_pw_p, Ts_cw_c, strict=True
+    ):
         T_odom_base = T_odom_lidar @ se3.inverse(MOUNT)
         others = edge(stamp_ns, "odom", "arm", np.eye(4))
         moving.publish(
-            kind(transforms=[others, edge(stamp_ns, "odom", "base", T_odom_base)])
+            kind(
+                transforms=[others, edge(stamp_ns, "odom", "base", T_odom_base)]
+            )
         )
         child.publish(message(Odometry, stamp_ns, T_cw_c, "camera"))
 

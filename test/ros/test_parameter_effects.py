@@ -60,7 +60,10 @@ CHANGES = {
     "nominal_radius": (0.1, {}),
     "nominal_separation": (0.5, {}),
     **{f"prior.{axis}": ("1+/-0.001", {}) for axis in "xyz"},
-    **{f"prior.{axis}": ("10deg+/-0.01deg", {}) for axis in ("roll", "pitch", "yaw")},
+    **{
+        f"prior.{axis}": ("10deg+/-0.01deg", {})
+        for axis in ("roll", "pitch", "yaw")
+    },
 }
 
 
@@ -78,7 +81,8 @@ def fed(tmp_path_factory):
     peer = ros_harness.Peer(domain)
     stamps_ns, Ts_pw_p, Ts_cw_c = ros_harness.drive(200)
     noise = se3.exp(
-        np.random.default_rng(0).normal(size=(2, 200, 6)) * np.repeat([0.01, 0.003], 3)
+        np.random.default_rng(0).normal(size=(2, 200, 6))
+        * np.repeat([0.01, 0.003], 3)
     )
     publishers = peer.publishers()
     peer.wait_matched(*publishers)
@@ -87,7 +91,9 @@ def fed(tmp_path_factory):
         (stamps_ns, Ts_pw_p @ noise[0], "lidar"),
         (late_ns, Ts_cw_c @ noise[1], "camera"),
     )
-    for publisher, (times_ns, Ts, frame) in zip(publishers, streams, strict=True):
+    for publisher, (times_ns, Ts, frame) in zip(
+        publishers, streams, strict=True
+    ):
         for stamp_ns, T in zip(times_ns.tolist(), Ts, strict=True):
             publisher.publish(
                 ros_harness.message(publisher.msg_type, stamp_ns, T, frame)
@@ -125,20 +131,28 @@ def test_a_change_while_the_node_runs_changes_the_answer_and_back(fed, name):
 
 def frame_is_used(start_node, peer, tmp_path, stream, text):
     start_node(*QUIET, f"-p {stream}_frame:=chosen")
-    assert text in peer.solve(peer.publishers(), *ros_harness.drive())[0].message
+    assert (
+        text in peer.solve(peer.publishers(), *ros_harness.drive())[0].message
+    )
 
 
 def type_is_used(start_node, peer, tmp_path, stream):
-    node = start_node(*QUIET, f"-p {stream}_type:=geometry_msgs/msg/PoseStamped")
+    node = start_node(
+        *QUIET, f"-p {stream}_type:=geometry_msgs/msg/PoseStamped"
+    )
     # The node subscribes although nobody publishes.
-    node.wait_for_log(f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)")
+    node.wait_for_log(
+        f"subscribed to /{stream}_odom (geometry_msgs/msg/PoseStamped)"
+    )
     peer.wait_matched(peer.publisher(PoseStamped, f"{stream}_odom"))
 
 
 def measures_is_used(start_node, peer, tmp_path, stream):
     start_node(*QUIET, f"-p {stream}_measures:=rotations")
     assert (
-        peer.solve(peer.publishers(), *ros_harness.drive())[1].transform.translation.x
+        peer.solve(peer.publishers(), *ros_harness.drive())[
+            1
+        ].transform.translation.x
         == 0.0
     )
 
@@ -156,7 +170,9 @@ def output_directory_is_used(start_node, peer, tmp_path):
     assert "output_directory" in peer.trigger("save").message
     peer.solve(peer.publishers(), *ros_harness.drive())
     assert not peer.trigger("save").success
-    assert peer.set_parameter("output_directory", str(tmp_path / "out")).successful
+    assert peer.set_parameter(
+        "output_directory", str(tmp_path / "out")
+    ).successful
     saved = peer.trigger("save")
     assert saved.success, saved.message
     assert (tmp_path / "out" / "extrinsic.yaml").exists()
@@ -171,8 +187,12 @@ def journal_is_used(start_node, peer, tmp_path):
     assert not peer.trigger("solve").success
     assert node.stop()[0] == 0
     assert not has_session(tmp_path / "off" / "journal")
-    start_node(*QUIET, f"-p output_directory:={tmp_path / 'new'}", "-p journal:=new")
-    peer.spin_until(lambda: has_session(tmp_path / "new" / "journal"), "a journal")
+    start_node(
+        *QUIET, f"-p output_directory:={tmp_path / 'new'}", "-p journal:=new"
+    )
+    peer.spin_until(
+        lambda: has_session(tmp_path / "new" / "journal"), "a journal"
+    )
 
 
 def others_are_solved_together(start_node, peer, tmp_path):
@@ -192,7 +212,10 @@ def others_are_solved_together(start_node, peer, tmp_path):
     peer.solve(peer.publishers(), stamps_ns, Ts_pw_p, Ts_cw_c)
     assert peer.trigger("save").message.endswith("rig/ follows")
     node.wait_for_log("rig/report.html\n", may_have_ended=True)
-    for name, T in (("camera", ros_harness.T_PARENT_CHILD), ("rear", T_PARENT_REAR)):
+    for name, T in (
+        ("camera", ros_harness.T_PARENT_CHILD),
+        ("rear", T_PARENT_REAR),
+    ):
         loaded = hec.load(tmp_path / "out/rig" / name)
         assert_allclose(loaded.T_parent_child, T, atol=1e-3)
     assert not (tmp_path / "out/report.html").exists()
@@ -202,7 +225,10 @@ def report_is_used(start_node, peer, tmp_path):
     """The report follows after the end of the node; a replay of the journal makes it again."""
     out = tmp_path / "out"
     node = start_node(
-        *QUIET, "-p report:=true", f"-p output_directory:={out}", "-p scale:=none"
+        *QUIET,
+        "-p report:=true",
+        f"-p output_directory:={out}",
+        "-p scale:=none",
     )
     with_a_gap = (poses[np.r_[0:60, 75:120]] for poses in ros_harness.drive())
     answer, _ = peer.solve(peer.publishers(), *with_a_gap)
@@ -239,7 +265,8 @@ def publish_tf_is_used(start_node, peer, tmp_path):
         return
     assert peer.set_parameter("publish_tf", True).successful
     peer.spin_until(
-        lambda: peer.node.count_subscribers("/tf") == 1, "the node to look at /tf"
+        lambda: peer.node.count_subscribers("/tf") == 1,
+        "the node to look at /tf",
     )
     assert peer.set_parameter("publish_tf", False).successful
     peer.spin_until(
@@ -256,7 +283,8 @@ def tf_is_used(start_node, peer, tmp_path, name, value, topic):
         )
         return
     peer.spin_until(
-        lambda: peer.node.count_subscribers(topic) == 1, f"a listener to {topic}"
+        lambda: peer.node.count_subscribers(topic) == 1,
+        f"a listener to {topic}",
     )
 
 
@@ -297,13 +325,15 @@ def monitor_is_used(start_node, peer, tmp_path):
     statuses = peer.diagnostics()
     peer.spin_until(lambda: statuses, "diagnostics")
     assert list(statuses) == [
-        f"/calibrator: {name}" for name in ("mount", "parent input", "child input")
+        f"/calibrator: {name}"
+        for name in ("mount", "parent input", "child input")
     ]
     # Its page has a button that ends the watch, and calibrates anew.
     assert peer.set_parameter("monitor", False).successful
     peer.solve(peer.publishers(), *ros_harness.drive(60))
     peer.spin_until(
-        lambda: "/calibrator: extrinsic" in statuses, "the state of a calibration"
+        lambda: "/calibrator: extrinsic" in statuses,
+        "the state of a calibration",
     )
 
 
@@ -316,9 +346,16 @@ def lifecycle_is_used(start_node, peer, tmp_path):
 TF = [(f"{stream}_tf", "odom:lidar", "/tf") for stream in STREAMS]
 TF.append(("base_frame", "base_link", "/tf_static"))
 EFFECTS = {
-    "parent_frame": partial(frame_is_used, stream="parent", text="camera in chosen: "),
-    "child_frame": partial(frame_is_used, stream="child", text="chosen in lidar: "),
-    **{f"{stream}_type": partial(type_is_used, stream=stream) for stream in STREAMS},
+    "parent_frame": partial(
+        frame_is_used, stream="parent", text="camera in chosen: "
+    ),
+    "child_frame": partial(
+        frame_is_used, stream="child", text="chosen in lidar: "
+    ),
+    **{
+        f"{stream}_type": partial(type_is_used, stream=stream)
+        for stream in STREAMS
+    },
     **{
         f"{stream}_measures": partial(measures_is_used, stream=stream)
         for stream in STREAMS
@@ -369,12 +406,18 @@ GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
     "child_frame": ("true", "true"),
     "solve_period": ("4", 4.0),
     "parent_type": ("nav_msgs/msg/Odometry", "nav_msgs/msg/Odometry"),
-    "child_type": ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseStamped"),
+    "child_type": (
+        "geometry_msgs/msg/PoseStamped",
+        "geometry_msgs/msg/PoseStamped",
+    ),
     "output_directory": ("{folder}/out", "{folder}/out"),
     "journal": ("off", "off"),
     "publish_tf": ("true", True),
     **{f"{stream}_measures": ("poses", "poses") for stream in STREAMS},
-    **{f"{stream}_tf": (f"odom:{stream}", f"odom:{stream}") for stream in STREAMS},
+    **{
+        f"{stream}_tf": (f"odom:{stream}", f"odom:{stream}")
+        for stream in STREAMS
+    },
     "other_children": ("2", 2),
     "report": ("false", False),
     "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
@@ -402,7 +445,12 @@ sys.exit(service.run())
 """
 
 
-LAUNCHER = [sys.executable, "-c", LAUNCH, str(ROOT / "launch" / "calibrator.launch.py")]
+LAUNCHER = [
+    sys.executable,
+    "-c",
+    LAUNCH,
+    str(ROOT / "launch" / "calibrator.launch.py"),
+]
 
 
 def environment(prefix, **more):
@@ -465,7 +513,9 @@ def start_launch(prefix, domain, tmp_path):
         for process, log in running:
             process.send_signal(signal.SIGINT)
             code = process.wait(ros_harness.PATIENCE_S)
-            assert (code, "Traceback" in log.read_text()) == (0, False), log.read_text()
+            assert (code, "Traceback" in log.read_text()) == (0, False), (
+                log.read_text()
+            )
     finally:
         for process, _ in running:
             with contextlib.suppress(ProcessLookupError):
@@ -477,14 +527,21 @@ def test_every_parameter_is_an_argument_and_arrives(
     start_launch, peer, tmp_path, names
 ):
     options = {name: GIVEN[name] for name in names}
-    texts = {name: text.format(folder=tmp_path) for name, (text, _) in options.items()}
+    texts = {
+        name: text.format(folder=tmp_path)
+        for name, (text, _) in options.items()
+    }
     start_launch(*(f"{name}:={text}" for name, text in texts.items()))
     for name, (_, value) in options.items():
-        expected = value.format(folder=tmp_path) if isinstance(value, str) else value
+        expected = (
+            value.format(folder=tmp_path) if isinstance(value, str) else value
+        )
         assert peer.parameter(name) == expected, name
 
 
-def test_what_is_not_given_is_left_to_the_parameter_file(start_launch, peer, tmp_path):
+def test_what_is_not_given_is_left_to_the_parameter_file(
+    start_launch, peer, tmp_path
+):
     config = tmp_path / "mine.yaml"
     config.write_text(
         "/**: {ros__parameters: {use_sim_time: true, method: park, scale: auto}}"
@@ -495,7 +552,9 @@ def test_what_is_not_given_is_left_to_the_parameter_file(start_launch, peer, tmp
     assert peer.parameter("scale") == 2
 
 
-TYPES = [f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child")]
+TYPES = [
+    f"{stream}_type:=nav_msgs/msg/Odometry" for stream in ("parent", "child")
+]
 
 
 @pytest.mark.parametrize(
@@ -510,19 +569,27 @@ def test_a_value_that_is_not_allowed_is_refused_with_its_name(
     prefix, argument, message
 ):
     """The node is not started."""
-    options = dict(capture_output=True, text=True, timeout=ros_harness.PATIENCE_S)
-    done = subprocess.run([*LAUNCHER, argument], env=environment(prefix), **options)
+    options = dict(
+        capture_output=True, text=True, timeout=ros_harness.PATIENCE_S
+    )
+    done = subprocess.run(
+        [*LAUNCHER, argument], env=environment(prefix), **options
+    )
     assert done.returncode == 1
     assert message in done.stdout + done.stderr
 
 
-def test_the_launch_file_also_serves_the_page_and_records(start_launch, peer, tmp_path):
+def test_the_launch_file_also_serves_the_page_and_records(
+    start_launch, peer, tmp_path
+):
     recorder = tmp_path / "bin" / "ros2"
     recorder.parent.mkdir()
     recorder.write_text('#!/bin/sh\necho "recorded: $*"\n')
     recorder.chmod(0o755)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PATH", f"{recorder.parent}{os.pathsep}{os.environ['PATH']}")
+        patch.setenv(
+            "PATH", f"{recorder.parent}{os.pathsep}{os.environ['PATH']}"
+        )
         log = start_launch(
             *TYPES,
             "namespace:=robot1",
@@ -536,7 +603,9 @@ def test_the_launch_file_also_serves_the_page_and_records(start_launch, peer, tm
         "open http://",
         "recorded: bag record -o drive /lidar/odom /robot1/child_odom /tf",
     )
-    peer.spin_until(lambda: all(text in log.read_text() for text in ready), f"{ready}")
+    peer.spin_until(
+        lambda: all(text in log.read_text() for text in ready), f"{ready}"
+    )
     assert (
         "/robot1/calibrator/extrinsic /robot1/calibrator/extrinsic_with"
         in log.read_text()
@@ -544,7 +613,11 @@ def test_the_launch_file_also_serves_the_page_and_records(start_launch, peer, tm
 
 
 def test_name_namespace_topics_and_log_level(start_launch, peer):
-    arguments = ["name:=front", "namespace:=/robot1", "parent_topic:=/lidar/odom"]
+    arguments = [
+        "name:=front",
+        "namespace:=/robot1",
+        "parent_topic:=/lidar/odom",
+    ]
     arguments += ["other_children:=1", "child2_topic:=/rear/odom"]
     arguments += [
         "publish_tf:=true",

@@ -6,7 +6,11 @@ import pytest
 from rcl_interfaces.srv import ListParameters
 from ros_harness import RELIABLE_INPUTS, drive
 
-from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, NodeConfig
+from hand_eye_calib.core.base.config import (
+    METHODS,
+    CalibratorConfig,
+    NodeConfig,
+)
 from hand_eye_calib.core.base.option import option_name
 
 FIELDS = {
@@ -26,7 +30,9 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(
     start_node, peer
 ):
     start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS)
-    assert set(FIELDS) <= set(peer.call(ListParameters, "list_parameters").result.names)
+    assert set(FIELDS) <= set(
+        peer.call(ListParameters, "list_parameters").result.names
+    )
     (of_threshold,) = peer.describe("threshold").floating_point_range
     assert (of_threshold.from_value, of_threshold.to_value) == (1e-12, 1e6)
     (of_max_pairs,) = peer.describe("max_pairs").integer_range
@@ -68,7 +74,11 @@ def test_every_option_is_a_described_parameter_changes_are_applied_or_rejected(
     ("name", "value", "expected"),
     [
         ("max_pairs", "many", "max_pairs must be a whole number; got 'many'"),
-        ("method", "magic", f"method must be one of {', '.join(METHODS)}; got 'magic'"),
+        (
+            "method",
+            "magic",
+            f"method must be one of {', '.join(METHODS)}; got 'magic'",
+        ),
         ("scale", "[]", "a parameter has an unusable value, such as []"),
     ],
 )
@@ -83,7 +93,9 @@ def test_bad_value_in_the_file_is_one_line_and_code_1(
 
 def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
     node = start_node(
-        parameter_file(tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=1),
+        parameter_file(
+            tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=1
+        ),
         *RELIABLE_INPUTS,
     )
     log = node.wait_for_log(
@@ -112,7 +124,9 @@ def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
 )
 def test_a_wrong_start_is_one_line(start_node, tmp_path, arguments, code, text):
     (tmp_path / "broken.yaml").write_text("a: [1\n b: {")
-    node = start_node(*(argument.format(folder=tmp_path) for argument in arguments))
+    node = start_node(
+        *(argument.format(folder=tmp_path) for argument in arguments)
+    )
     assert node.wait() == code
     assert text.format(folder=tmp_path) in node.log
     assert node.log.count("\n") == 1

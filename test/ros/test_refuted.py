@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from motions import disturbed
-from ros_harness import RELIABLE_INPUTS, START_NS, T_PARENT_CHILD, matrix, values_of
+from ros_harness import (
+    RELIABLE_INPUTS,
+    START_NS,
+    T_PARENT_CHILD,
+    matrix,
+    values_of,
+)
 from std_msgs.msg import String
 
 from hand_eye_calib.core.geometry import se3
@@ -47,8 +53,12 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     statuses = peer.diagnostics()
     states = peer.listen(String, "progress")
     stamps_ns, Ts_pw_p, Ts_cw_c = drive_over_ramps()
-    _, early = peer.solve(publishers, stamps_ns[:100], Ts_pw_p[:100], Ts_cw_c[:100])
-    assert matrix(early)[2, 3] == pytest.approx(WRONG_Z, abs=0.02)  # of the prior alone
+    _, early = peer.solve(
+        publishers, stamps_ns[:100], Ts_pw_p[:100], Ts_cw_c[:100]
+    )
+    assert matrix(early)[2, 3] == pytest.approx(
+        WRONG_Z, abs=0.02
+    )  # of the prior alone
 
     peer.feed(publishers, stamps_ns[100:], Ts_pw_p[100:], Ts_cw_c[100:])
     sentence = "the prior on z is"
@@ -58,7 +68,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     )
     advice = "The value typed in for z contradicts the motion"
     peer.spin_until(
-        lambda: advice in statuses["/calibrator: progress"].message, "the advice"
+        lambda: advice in statuses["/calibrator: progress"].message,
+        "the advice",
     )
     answer = peer.trigger("solve")
     assert (
@@ -78,7 +89,10 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
         assert status.message.endswith(endings[name])
     values = values_of(statuses["/calibrator: extrinsic"])
     assert (values["standing"], values["contradicted"]) == ("refuted", "z")
-    assert json.loads(states[-1].data)["extrinsic"]["result"]["verdict"] == "DO NOT USE"
+    assert (
+        json.loads(states[-1].data)["extrinsic"]["result"]["verdict"]
+        == "DO NOT USE"
+    )
     # Who subscribes now gets no number.
     late = peer.listen(TransformStamped, "extrinsic")
     late_with_covariance = peer.listen(
@@ -87,7 +101,10 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     late_states = peer.listen(String, "progress")
     peer.spin_until(lambda: late_states, "what is latched")
     saved = peer.trigger("save")
-    assert (saved.success, ": DO NOT USE: the prior on z is " in saved.message) == (
+    assert (
+        saved.success,
+        ": DO NOT USE: the prior on z is " in saved.message,
+    ) == (
         True,
         True,
     )
@@ -107,16 +124,25 @@ def test_a_prior_that_is_removed_gives_the_result_of_the_same_poses_back(
     start_node, peer
 ):
     start_node(
-        "-p solve_period:=0.2", f"-p prior.z:={WRONG_Z:.3f}+/-0.02", *RELIABLE_INPUTS
+        "-p solve_period:=0.2",
+        f"-p prior.z:={WRONG_Z:.3f}+/-0.02",
+        *RELIABLE_INPUTS,
     )
     publishers = peer.publishers()
     statuses = peer.diagnostics()
     extrinsics = peer.listen(TransformStamped, "extrinsic")
     peer.feed(publishers, *drive_over_ramps())
-    standing = lambda: values_of(statuses["/calibrator: extrinsic"]).get("standing")  # noqa: E731
-    peer.spin_until(lambda: statuses and standing() == "refuted", "the contradiction")
+
+    def standing():
+        return values_of(statuses["/calibrator: extrinsic"]).get("standing")
+
+    peer.spin_until(
+        lambda: statuses and standing() == "refuted", "the contradiction"
+    )
     assert peer.set_parameter("prior.z", "").successful
-    peer.spin_until(lambda: standing() == "current", "the result without the prior")
+    peer.spin_until(
+        lambda: standing() == "current", "the result without the prior"
+    )
 
     def is_right():
         return (

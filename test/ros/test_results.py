@@ -39,7 +39,8 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
     last_ns = drive()[0][-1]
     stamp_ns = lambda: ns_of(extrinsics[-1].header.stamp)  # noqa: E731
     peer.spin_until(
-        lambda: extrinsics and stamp_ns() == last_ns and poses, "a result of all"
+        lambda: extrinsics and stamp_ns() == last_ns and poses,
+        "a result of all",
     )
     assert_allclose(matrix(extrinsics[-1]), T_PARENT_CHILD, atol=1e-3)
     assert (extrinsics[-1].header.frame_id, extrinsics[-1].child_frame_id) == (
@@ -47,7 +48,9 @@ def test_extrinsic_of_a_noise_free_drive_comes_by_itself(start_node, peer):
         "camera",
     )
     # Each result is told at once, with the state.
-    values = [f'"x": {transform.transform.translation.x},' for transform in extrinsics]
+    values = [
+        f'"x": {transform.transform.translation.x},' for transform in extrinsics
+    ]
     peer.spin_until(
         lambda: all(value in str(documents) for value in values), "the states"
     )
@@ -94,14 +97,18 @@ def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
     publishers = peer.publishers(kind, child_kind=Odometry)
     _, extrinsic = peer.solve(publishers, *drive())
     assert_allclose(matrix(extrinsic), T_PARENT_CHILD, atol=1e-3)
-    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == ("lidar", "camera")
+    assert (extrinsic.header.frame_id, extrinsic.child_frame_id) == (
+        "lidar",
+        "camera",
+    )
     late = peer.listen(TransformStamped, "extrinsic")
     late_with_covariance = peer.listen(
         PoseWithCovarianceStamped, "extrinsic_with_covariance"
     )
     late_markers = peer.listen(MarkerArray, "markers")
     peer.spin_until(
-        lambda: late and late_with_covariance and late_markers, "the latched result"
+        lambda: late and late_with_covariance and late_markers,
+        "the latched result",
     )
     assert {marker.ns for marker in late_markers[-1].markers} > {
         "parent",
@@ -112,7 +119,9 @@ def test_each_message_type_is_found_from_the_graph(start_node, peer, kind):
     assert late_with_covariance[0].header == extrinsic.header
 
 
-def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, peer):
+def test_topic_of_another_type_is_named_with_the_types_that_work(
+    start_node, peer
+):
     node = start_node(
         "-p child_type:=geometry_msgs/msg/PoseStamped", "-p solve_period:=0.1"
     )
@@ -125,11 +134,10 @@ def test_topic_of_another_type_is_named_with_the_types_that_work(start_node, pee
         "/child_odom: it has type nav_msgs/msg/Odometry; expected geometry_msgs/msg/PoseStamped: ",
     )
     statuses = peer.diagnostics()
-    sentence = (
-        "no message on /child_odom yet: it has type nav_msgs/msg/Odometry; expected"
-    )
+    sentence = "no message on /child_odom yet: it has type nav_msgs/msg/Odometry; expected"
     peer.spin_until(
-        lambda: sentence in str(statuses.get("/calibrator: child input")), "the status"
+        lambda: sentence in str(statuses.get("/calibrator: child input")),
+        "the status",
     )
 
 
@@ -163,7 +171,9 @@ def recording():
     )
 
 
-def test_a_recording_through_the_node_equals_the_engine_fed_directly(start_node, peer):
+def test_a_recording_through_the_node_equals_the_engine_fed_directly(
+    start_node, peer
+):
     stamps_ns, *Ts_w, T_true, off = recording()
     options = {"method": "dnlo", "reference": "B10", "max_gap": 60.0}
     engine = Calibrator(CalibratorConfig.from_options(options))
@@ -180,17 +190,19 @@ def test_a_recording_through_the_node_equals_the_engine_fed_directly(start_node,
     arguments = [f"-p {name}:={value}" for name, value in options.items()]
     start_node("-p solve_period:=1000.0", *arguments, *RELIABLE_INPUTS)
     answer, extrinsic = peer.solve(peer.publishers(), stamps_ns, *Ts_w)
-    assert_allclose(matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9)
-    assert ns_of(extrinsic.header.stamp) == offline.stamp_ns
-    counts = (
-        f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
+    assert_allclose(
+        matrix(extrinsic), offline.T_parent_child, rtol=0, atol=1e-9
     )
+    assert ns_of(extrinsic.header.stamp) == offline.stamp_ns
+    counts = f"{offline.n_poses} poses, {offline.n_pairs} pairs, {offline.n_inliers} inliers"
     assert counts in answer.message
     metres, radians = se3.absolute_errors(matrix(extrinsic), T_true)
     assert (metres, np.degrees(radians)) == pytest.approx(off, abs=0.01)
 
 
-def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, peer):
+def test_motion_that_hides_a_direction_is_published_with_a_warning(
+    start_node, peer
+):
     stamps_ns, _, _ = drive(400)
     s = (stamps_ns - START_NS) * 1e-9
     flat = se3.from_rotation_translation(
@@ -203,7 +215,9 @@ def test_motion_that_hides_a_direction_is_published_with_a_warning(start_node, p
     answer, extrinsic = peer.solve(peer.publishers(), stamps_ns, flat, child)
     assert not answer.success
     assert "status unobservable" in answer.message
-    assert answer.message.startswith("USE WITH CARE: all but z; measure z by hand")
+    assert answer.message.startswith(
+        "USE WITH CARE: all but z; measure z by hand"
+    )
     reason = (
         "z cannot be determined from this motion; measure it "
         "by hand and give a prior, such as prior.z "

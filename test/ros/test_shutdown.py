@@ -68,7 +68,9 @@ def test_a_full_temporary_directory_costs_the_report_and_not_the_result(
     assert saved.message.endswith(
         "; report.html cannot be written: No space left on device"
     )
-    assert_allclose(load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3)
+    assert_allclose(
+        load_result(tmp_path).T_parent_child, T_PARENT_CHILD, atol=1e-3
+    )
     (tmp_path / "extrinsic.yaml").unlink()
     stopped(node, signal.SIGTERM)
     assert load_result(tmp_path).n_poses == 120
@@ -88,15 +90,22 @@ solving.SolvingProcess._restart = restarted
 """
 
 
-def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(start_node, peer):
+def test_a_solving_process_that_hangs_is_noticed_and_the_node_goes_on(
+    start_node, peer
+):
     node = start_node("-p solve_period:=1000.0", *RELIABLE_INPUTS, before=SOON)
     assert peer.trigger("reset").success
     pid = node.process.pid
-    os.kill(int(Path(f"/proc/{pid}/task/{pid}/children").read_text()), signal.SIGSTOP)
+    os.kill(
+        int(Path(f"/proc/{pid}/task/{pid}/children").read_text()),
+        signal.SIGSTOP,
+    )
     answer = peer.trigger("solve")
     sentence = "the solving process had no answer after 5 s and was killed"
     # On a busy computer, the answer may come before the end of the process.
-    is_answered = sentence in answer.message or "still solving" in answer.message
+    is_answered = (
+        sentence in answer.message or "still solving" in answer.message
+    )
     assert (answer.success, is_answered) == (False, True)
     node.wait_for_log(sentence, "it was started again")
     answer, _ = peer.solve(peer.publishers(), *drive())

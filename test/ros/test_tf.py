@@ -26,7 +26,10 @@ from hand_eye_calib.online.ros.tf import RobotTree
     ("edges", "why"),
     [
         ([("base_link", "lidar"), ("map", "base_link")], ""),
-        ([("a", "lidar"), ("lidar", "a")], ""),  # a circle of others is no endless loop
+        (
+            [("a", "lidar"), ("lidar", "a")],
+            "",
+        ),  # a circle of others is no endless loop
         (
             [("base_link", "lidar"), ("base_link", "camera")],
             "camera has the parent base_link on /tf_static already",
@@ -48,7 +51,10 @@ def calibration():
     calibrator = Calibrator(CalibratorConfig(reference="B3"))
     noise = se3.exp(np.random.default_rng(0).normal(size=(150, 6)) * 1e-3)
     parent = wandering_poses(150)
-    for stream, poses in (("parent", parent @ noise), ("child", child_of(parent))):
+    for stream, poses in (
+        ("parent", parent @ noise),
+        ("child", child_of(parent)),
+    ):
         feed(calibrator, stream, as_trajectory(poses))
     return calibrator.estimate()
 
@@ -80,7 +86,9 @@ class TestNode:
 
         def publish(*edges):
             publisher = peer.node.create_publisher(kind, "/tf_static", LATCHED)
-            transforms = [TransformStamped(child_frame_id=child) for _, child in edges]
+            transforms = [
+                TransformStamped(child_frame_id=child) for _, child in edges
+            ]
             for transform, (parent, _) in zip(transforms, edges, strict=True):
                 transform.header.frame_id = parent
             publisher.publish(kind(transforms=transforms))
@@ -112,7 +120,9 @@ class TestNode:
 
         def fault():
             newest = statuses.get("/calibrator: progress")
-            is_faulty = newest is not None and values_of(newest)["is_faulty"] == "true"
+            is_faulty = (
+                newest is not None and values_of(newest)["is_faulty"] == "true"
+            )
             return newest.message if is_faulty else ""
 
         publishers = peer.publishers()
@@ -123,7 +133,9 @@ class TestNode:
         peer.spin_until(is_early, "the state", fault)
         assert state() == "not_yet"
         peer.solve(publishers, *(half[250:] for half in poses))
-        peer.spin_until(lambda: state("progress", "done") == "true", "the goal", fault)
+        peer.spin_until(
+            lambda: state("progress", "done") == "true", "the goal", fault
+        )
         # Nothing comes in any more: the two results that reached the goal suffice.
         peer.spin_until(lambda: edges(heard), "the edge")
         peer.spin_until(lambda: state() == "broadcast", "the state")
@@ -132,7 +144,10 @@ class TestNode:
         assert pytest.approx(matrix(extrinsics[-1])) == T
         # The answer, the file and the page say the same, and of the same poses.
         answer = peer.trigger("solve").message
-        assert f"xyz = ({', '.join(f'{value:.4f}' for value in T[:3, 3])})" in answer
+        assert (
+            f"xyz = ({', '.join(f'{value:.4f}' for value in T[:3, 3])})"
+            in answer
+        )
         assert peer.trigger("save").success
         saved = load_result(tmp_path)
         assert saved.T_parent_child == pytest.approx(T)
@@ -172,7 +187,8 @@ class TestNode:
         assert standing is Broadcast.REFUSED
         assert why.startswith(f"{child} has the parent base_link on /tf_static")
         assert (
-            f"publish_tf is refused: {child} has the parent" in capfd.readouterr().err
+            f"publish_tf is refused: {child} has the parent"
+            in capfd.readouterr().err
         )
 
     def test_a_parent_that_comes_later_ends_the_broadcast(
@@ -203,11 +219,15 @@ class TestNode:
             dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf
         )
         broadcaster.update(
-            dataclasses.replace(calibration, observability_measured=tuple(dofs)), ""
+            dataclasses.replace(
+                calibration, observability_measured=tuple(dofs)
+            ),
+            "",
         )
         assert broadcaster.state == (Broadcast.REFUSED, "z not determined")
         broadcaster.update(
-            dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED), ""
+            dataclasses.replace(calibration, status=SolveStatus.NOT_CONVERGED),
+            "",
         )
         assert broadcaster.state[0] is Broadcast.REFUSED
         assert broadcaster.state[1].startswith(
@@ -218,6 +238,7 @@ class TestNode:
     def frames_of_new_listener(peer, listen, until):
         heard = listen()
         peer.spin_until(
-            lambda: until in {transform.child_frame_id for transform in heard}, until
+            lambda: until in {transform.child_frame_id for transform in heard},
+            until,
         )
         return {transform.child_frame_id for transform in heard}

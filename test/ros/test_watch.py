@@ -36,7 +36,9 @@ def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
     watcher = Watcher.__new__(Watcher)
     watcher._board = Board()
     watcher._sources = set()
-    topics = [(f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)]
+    topics = [
+        (f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)
+    ]
     watcher._node = SimpleNamespace(
         get_topic_names_and_types=lambda: topics,
         create_subscription=lambda kind, topic, *_: heard.append(topic),
@@ -57,13 +59,18 @@ class Watch:
                 stdout=seen,
                 stderr=notes,
                 env=os.environ
-                | {"ROS_DOMAIN_ID": str(domain), "XDG_STATE_HOME": str(directory)},
+                | {
+                    "ROS_DOMAIN_ID": str(domain),
+                    "XDG_STATE_HOME": str(directory),
+                },
             )
 
     def wait_for(self, pattern, file=None):
         """Wait until a file, by default what was seen, has a pattern; returns the match."""
         end = time.monotonic() + PATIENCE_S
-        while not (match := re.search(pattern, (file or self.seen).read_text())):
+        while not (
+            match := re.search(pattern, (file or self.seen).read_text())
+        ):
             text = self.seen.read_text() + self.notes.read_text()
             assert time.monotonic() < end, f"no {pattern!r} in:\n{text}"
             assert self.process.poll() is None, text

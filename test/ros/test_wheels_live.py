@@ -28,7 +28,9 @@ def machine_of(model, duration_s):
 
 def stamped(kind, stamp_ns, frame=""):
     result = kind()
-    result.header.stamp.sec, result.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    result.header.stamp.sec, result.header.stamp.nanosec = divmod(
+        stamp_ns, 10**9
+    )
     result.header.frame_id = frame
     return result
 
@@ -38,7 +40,9 @@ def wheel_odometry(machine):
     radius_m, track_m = 0.1, 0.5
     left, right = machine.values.T * radius_m
     nominal = np.column_stack([(left + right) / 2, (right - left) / track_m])
-    odometry = hec.wheel_trajectory(machine.stamps_ns, nominal, "wheel_odometry")
+    odometry = hec.wheel_trajectory(
+        machine.stamps_ns, nominal, "wheel_odometry"
+    )
     return [message(Odometry, *row, "base_link") for row in rows(odometry)]
 
 
@@ -65,7 +69,9 @@ def car_states(machine):
         for side in (-1, 1)
     ]
     messages = []
-    for stamp_ns, *row in zip(machine.stamps_ns.tolist(), angles, *both, strict=True):
+    for stamp_ns, *row in zip(
+        machine.stamps_ns.tolist(), angles, *both, strict=True
+    ):
         state = stamped(JointState, stamp_ns)
         state.name = [
             "rear_left_wheel",
@@ -84,7 +90,9 @@ def twists(machine):
         machine.stamps_ns.tolist(), machine.values.tolist(), strict=True
     ):
         twist = stamped(TwistStamped, stamp_ns, "base_link")
-        twist.twist.linear.x, twist.twist.linear.y, twist.twist.angular.z = values
+        twist.twist.linear.x, twist.twist.linear.y, twist.twist.angular.z = (
+            values
+        )
         messages.append(twist)
     return messages
 
@@ -110,7 +118,12 @@ def publish(peer, messages, machine):
 
 # Model of the machine, kind of wheel data, messages, and the parameter to look at.
 CASES = {
-    "odometry": ("wheels", "wheel_odometry", wheel_odometry, "wheel_radius_multiplier"),
+    "odometry": (
+        "wheels",
+        "wheel_odometry",
+        wheel_odometry,
+        "wheel_radius_multiplier",
+    ),
     "joint states": ("wheels", "auto", joint_states, "wheel_separation"),
     "joint states of a car": ("steering", "steering", car_states, "wheelbase"),
     "twists": ("omni", "omni", twists, "turn_multiplier"),
@@ -135,10 +148,13 @@ def test_wheels_as_parent(start_node, peer, tmp_path, case):
         """Whether both inputs have messages, and no more in the last states."""
         inputs = [json.loads(state.data)["inputs"] for state in states[-3:]]
         numbers = [
-            {name: part["messages"] for name, part in state.items()} for state in inputs
+            {name: part["messages"] for name, part in state.items()}
+            for state in inputs
         ]
         return (
-            len(numbers) == 3 and numbers[0] == numbers[2] and all(numbers[0].values())
+            len(numbers) == 3
+            and numbers[0] == numbers[2]
+            and all(numbers[0].values())
         )
 
     peer.spin_until(have_arrived, "all messages")
@@ -151,7 +167,9 @@ def test_wheels_as_parent(start_node, peer, tmp_path, case):
     truth = {"wheel_separation": 2, "wheelbase": 1, "turn_multiplier": 2}
     if parameter in truth:
         expected = machine.parameters[truth[parameter]]
-        assert saved.wheels[parameter].value == pytest.approx(expected, rel=0.01)
+        assert saved.wheels[parameter].value == pytest.approx(
+            expected, rel=0.01
+        )
     assert "Traceback" not in node.log
 
 

@@ -140,23 +140,31 @@ def correlate_rates(
     if min(len(parent), len(child)) < 4:
         return Correlation()
     step_s = float(
-        np.clip(max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S)
+        np.clip(
+            max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S
+        )
     )
-    step_s = max(step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES)
+    step_s = max(
+        step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES
+    )
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
     parent_rates = angular_rates(parent, window_s, step_s, max_gap_s, of_speed)
     child_rates = angular_rates(child, window_s, step_s, max_gap_s, of_speed)
     if _shorter_s(parent_rates, child_rates, step_s) < _MIN_OVERLAP_S:
         return Correlation()
     start_s = float(parent.stamps_ns[0] - child.stamps_ns[0]) * 1e-9
-    best = _best_correlation(parent_rates, child_rates, start_s, step_s, window_s)
+    best = _best_correlation(
+        parent_rates, child_rates, start_s, step_s, window_s
+    )
     if best.is_clear:
         return best
     _clear_repetitions(parent, parent_rates, step_s, window_s)
     _clear_repetitions(child, child_rates, step_s, window_s)
     if _shorter_s(parent_rates, child_rates, step_s) < _MIN_OVERLAP_S:
         return best
-    second = _best_correlation(parent_rates, child_rates, start_s, step_s, window_s)
+    second = _best_correlation(
+        parent_rates, child_rates, start_s, step_s, window_s
+    )
     return second if second.is_clear else best
 
 
@@ -175,7 +183,9 @@ def _clear_repetitions(
     """Set those of the rates (M,) to NaN whose windows contain a repeated pose of a stream."""
     start_ns = int(stream.stamps_ns[0])
     for from_ns, until_ns in repetitions(stream, _MIN_REPETITION_S):
-        first = max(int(((from_ns - start_ns) * 1e-9 - window_s) / step_s) + 1, 0)
+        first = max(
+            int(((from_ns - start_ns) * 1e-9 - window_s) / step_s) + 1, 0
+        )
         last = int((until_ns - start_ns) * 1e-9 / step_s) + 1
         rates[first : last + 1] = np.nan
 
@@ -198,10 +208,14 @@ def _best_correlation(
     step_s, window_s : float
         Distance between the starts of windows, and length of a window.
     """
-    lags, coefficients, overlaps, ratios = _masked_correlation(of_parent, of_child)
+    lags, coefficients, overlaps, ratios = _masked_correlation(
+        of_parent, of_child
+    )
     durations = overlaps * step_s
     shorter_s = min(len(of_parent), len(of_child)) * step_s
-    is_possible = durations >= max(_MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S)
+    is_possible = durations >= max(
+        _MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S
+    )
     # Fisher's z of n samples has the standard deviation 1 / sqrt(n - 3). There is about one
     # independent sample per second.
     fisher_z = np.arctanh(np.clip(coefficients, -1 + 1e-9, 1 - 1e-9))
@@ -212,7 +226,9 @@ def _best_correlation(
     peak_width_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
     rivals = significance[np.abs(lags_s - lags_s[best]) > peak_width_s]
     # Vertex of the parabola through the best lag and its neighbours, in steps from the best lag.
-    below, top, above = coefficients[np.arange(best - 1, best + 2) % len(coefficients)]
+    below, top, above = coefficients[
+        np.arange(best - 1, best + 2) % len(coefficients)
+    ]
     curvature = below - 2 * top + above
     vertex = 0.0
     if curvature < 0:
@@ -220,8 +236,12 @@ def _best_correlation(
     return Correlation(
         offset_s=float(start_s + (lags[best] + vertex) * step_s),
         correlation=float(top),
-        distinctness=float(significance[best] / max(rivals.max(initial=-np.inf), 1.0)),
-        variation=min(float(np.nanstd(rates)) for rates in (of_parent, of_child)),
+        distinctness=float(
+            significance[best] / max(rivals.max(initial=-np.inf), 1.0)
+        ),
+        variation=min(
+            float(np.nanstd(rates)) for rates in (of_parent, of_child)
+        ),
         ratio=float(ratios[best]),
     )
 
@@ -240,11 +260,13 @@ def angular_rates(
     """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
-    starts_ns = stamps_ns[0] + np.round(np.arange(n_windows) * step_s * 1e9).astype(
-        np.int64
-    )
+    starts_ns = stamps_ns[0] + np.round(
+        np.arange(n_windows) * step_s * 1e9
+    ).astype(np.int64)
     ends_ns = starts_ns + round(window_s * 1e9)
-    before, after = np.split(trajectory.at(np.concatenate([starts_ns, ends_ns])), 2)
+    before, after = np.split(
+        trajectory.at(np.concatenate([starts_ns, ends_ns])), 2
+    )
     if of_speed:
         moved = np.linalg.norm(
             se3.translation_of(after) - se3.translation_of(before), axis=1
@@ -256,7 +278,9 @@ def angular_rates(
         moved = se3.rotation_angle(rotations)
     rates = moved / window_s
     # Number of long gaps before each pose. A window overlaps a gap if it differs at both ends.
-    gaps_before = np.r_[0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)]
+    gaps_before = np.r_[
+        0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)
+    ]
     first = np.searchsorted(stamps_ns, starts_ns, side="right") - 1
     last = np.minimum(np.searchsorted(stamps_ns, ends_ns), len(stamps_ns) - 1)
     rates[gaps_before[last] > gaps_before[first]] = np.nan
@@ -289,7 +313,9 @@ def _masked_correlation(
         roots = np.sqrt(rates)
         roots = np.minimum(roots, quantile(roots[mask], 1 - _CLIPPED_SHARE))
         filled = np.where(mask, roots - np.nanmean(roots), 0.0)
-        spectra.append(np.fft.rfft([mask.astype(float), filled, filled**2], size))
+        spectra.append(
+            np.fft.rfft([mask.astype(float), filled, filled**2], size)
+        )
     # Sums over the common samples at each lag are inverse transforms of products of spectra.
     one_a, a, aa = spectra[0]
     one_b, b, bb = np.conj(spectra[1])

@@ -25,7 +25,11 @@ from hand_eye_calib.core.base.blocks import Blocks, solve
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import MEDIAN_LENGTH, median, robust_weights
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 from hand_eye_calib.core.solvers import all_pairs, quadratic_form
 
 # Number of random subsets of motion pairs, each of which yields a start.
@@ -205,7 +209,9 @@ def fit_similarity(
     # The best fit has the smallest volume of residuals, measured in the smaller unit of length.
     return min(
         fits,
-        key=lambda fit: fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1),
+        key=lambda fit: (
+            fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1)
+        ),
     )
 
 
@@ -266,7 +272,9 @@ def _best_scale(
     for lag_s in _SCALE_LAGS_S[len(fits) :]:
         pairs = pairs_over(pose_pairs, lag_s)
         if len(pairs) >= MIN_PAIRS:
-            fits.append(fit_similarity(pairs, start=fits[-1] if fits else start))
+            fits.append(
+                fit_similarity(pairs, start=fits[-1] if fits else start)
+            )
     if not fits:
         raise NotEnoughDataError(
             f"the scale cannot be estimated from {len(pose_pairs)} pose pairs: fewer than "
@@ -342,13 +350,17 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     sums = _random_subsets(len(few)) @ quadratic_form.condense(few)
     subset_forms = quadratic_form.expand(sums)
     more_rotations = all_pairs.start_rotations(few)
-    rotations = np.concatenate([_closed_form_rotations(subset_forms), more_rotations])
+    rotations = np.concatenate(
+        [_closed_form_rotations(subset_forms), more_rotations]
+    )
     # The further rotations belong to the form of all pairs.
     forms_of_all = np.repeat(subset_forms[:1], len(more_rotations), axis=0)
     forms = np.concatenate([subset_forms, forms_of_all])
     # Scale and translation that minimise the form of each rotation.
     reduced, to_translation = quadratic_form.without_translation(forms)
-    vectors = np.append(rotations.reshape(-1, 9), np.zeros((len(forms), 1)), axis=1)
+    vectors = np.append(
+        rotations.reshape(-1, 9), np.zeros((len(forms), 1)), axis=1
+    )
     products = se3.times(reduced, vectors)
     squares = (vectors * products).sum(axis=1)
     scales = -products[:, 9] / np.maximum(squares, 1e-300)
@@ -357,7 +369,9 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     scaled_vectors = scales[:, None] * vectors + np.eye(10)[9]
     translations = -se3.times(to_translation, scaled_vectors)
     Ts = se3.from_rotation_translation(rotations, translations)
-    costs = quadratic_form.median_costs(quadratic_form.coefficients(few), Ts, scales)
+    costs = quadratic_form.median_costs(
+        quadratic_form.coefficients(few), Ts, scales
+    )
     Ts[:, :3, 3] *= unit_of_parent
     scales *= unit_of_parent / unit_of_child
     best = np.argsort(costs)[:_N_REFINED_STARTS]
@@ -431,7 +445,9 @@ class _Problem:
         self.skew_b = se3.skew(self.translation_b)
         self.rms_a = _rms_translation(A)
         self.rms_b = _rms_translation(B)
-        self.rms_rotation = float(np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2)))
+        self.rms_rotation = float(
+            np.sqrt(np.mean(se3.rotation_angle(rotation_a) ** 2))
+        )
         # Indices of the unknowns that are estimated.
         self.free = list(range(_SCALE))
         if not same_unit:
@@ -443,7 +459,9 @@ class _Problem:
         # an instant is the pose that it had d earlier.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.rotation_by_offset = rotated_i - twists_j[:, 3:]
-        moved_i = twists_i[:, :3] + se3.cross(twists_i[:, 3:], self.translation_b)
+        moved_i = twists_i[:, :3] + se3.cross(
+            twists_i[:, 3:], self.translation_b
+        )
         moved_j = np.einsum("kij,kj->ki", rotation_b, twists_j[:, :3])
         self.translation_by_offset = moved_i - moved_j
 
@@ -470,7 +488,9 @@ class _Problem:
         lengths_rad = np.linalg.norm(rotations[:, :, -1], axis=1)
         least_m = max(_MIN_SIGMA_TRANSLATION * self.rms_a, 1e-12)
         sigma_m = max(median(lengths_m) / MEDIAN_LENGTH, least_m)
-        sigma_rad = max(median(lengths_rad) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION)
+        sigma_rad = max(
+            median(lengths_rad) / MEDIAN_LENGTH, _MIN_SIGMA_ROTATION
+        )
         squared = (lengths_m / sigma_m) ** 2 + (lengths_rad / sigma_rad) ** 2
         relative = squared / (6 * _QUARTER_WEIGHT_SIGMAS**2)
         root = np.sqrt(robust_weights("geman_mcclure", relative))
@@ -490,7 +510,9 @@ class _Problem:
         rows[:, :, _SCALE] = -scale * self.translation_b @ back
         rows[:, :, _OFFSET] = -scale * self.translation_by_offset @ back
         moved_b = self.translation_b + self.translation_by_offset * offset_s
-        rows[:, :, -1] = self.chord_a @ se3.translation_of(T) + self.translation_a
+        rows[:, :, -1] = (
+            self.chord_a @ se3.translation_of(T) + self.translation_a
+        )
         rows[:, :, -1] -= scale * moved_b @ back
         return rows
 
@@ -511,7 +533,9 @@ class _Problem:
         rows[:, :, -1] += offset_s * rows[:, :, _OFFSET]
         return rows
 
-    def refine(self, T: FloatArray, scale: float) -> tuple[FloatArray, float, float]:
+    def refine(
+        self, T: FloatArray, scale: float
+    ) -> tuple[FloatArray, float, float]:
         """Return X, scale and offset after Gauss-Newton steps with robust weights."""
         offset_s = 0.0
         for _ in range(_MAX_STEPS):
@@ -531,7 +555,9 @@ class _Problem:
                 break
         return T, scale, offset_s
 
-    def shares(self, sigmas: tuple[float, float], scale: float) -> tuple[float, float]:
+    def shares(
+        self, sigmas: tuple[float, float], scale: float
+    ) -> tuple[float, float]:
         """Return the unexplained shares of the translations and of the motion.
 
         ``sigmas`` are the standard deviations of the residuals, m and rad.
@@ -543,7 +569,9 @@ class _Problem:
         of_rotation = sigmas[1] / max(self.rms_rotation, 1e-12)
         return of_translation, float(np.hypot(of_translation, of_rotation))
 
-    def describe(self, T: FloatArray, scale: float, offset_s: float) -> SimilarityFit:
+    def describe(
+        self, T: FloatArray, scale: float, offset_s: float
+    ) -> SimilarityFit:
         """Return the fit at X, s and d, with its uncertainty and its quality."""
         parts, sigmas_of_residuals, root = self.rows(T, scale, offset_s)
         rows = np.concatenate(parts, axis=1)
@@ -557,10 +585,14 @@ class _Problem:
         # change as d changes. Geman-McClure weights reduce the curvature of the cost by this share.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
         fall = (
-            pulls.sum() / (1.5 * _QUARTER_WEIGHT_SIGMAS**2) / max(weights.sum(), 1e-300)
+            pulls.sum()
+            / (1.5 * _QUARTER_WEIGHT_SIGMAS**2)
+            / max(weights.sum(), 1e-300)
         )
         curvature_share = float(np.clip(1.0 - fall, 0.5, 1.0))
-        offsets = -blocks.sums[:, _OFFSET, -1] / np.where(weights > 0.0, weights, 1.0)
+        offsets = -blocks.sums[:, _OFFSET, -1] / np.where(
+            weights > 0.0, weights, 1.0
+        )
         of_translation, unexplained = self.shares(sigmas_of_residuals, scale)
         scale_sigma = scale * float(sigmas[_SCALE])
         difference = abs(scale - 1.0)
@@ -579,8 +611,10 @@ class _Problem:
             sigma_rotation=sigmas_of_residuals[1],
             unexplained_translation=of_translation,
             explains_translation=of_translation < _MAX_UNEXPLAINED_TRANSLATION,
-            is_in_one_unit=difference + _MIN_SIGMAS * scale_sigma < _MIN_DIFFERENCE,
-            has_own_unit=differs and of_translation < _MAX_UNEXPLAINED_OF_OTHER_UNIT,
+            is_in_one_unit=difference + _MIN_SIGMAS * scale_sigma
+            < _MIN_DIFFERENCE,
+            has_own_unit=differs
+            and of_translation < _MAX_UNEXPLAINED_OF_OTHER_UNIT,
             unexplained=unexplained,
         )
 

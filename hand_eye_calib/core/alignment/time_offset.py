@@ -10,7 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
+from hand_eye_calib.core.alignment.rate_correlation import (
+    Correlation,
+    correlate_rates,
+)
 from hand_eye_calib.core.alignment.similarity import (
     MIN_PAIRS,
     SimilarityFit,
@@ -189,7 +192,8 @@ def refine_time_offset(
         the motion.
     """
     reach_s = max(
-        _FINE_RANGE_S, _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s)
+        _FINE_RANGE_S,
+        _FINE_RANGE_INTERVALS * max(parent.interval_s, child.interval_s),
     )
     coarse_s = at.correlation.offset_s
     best = TimeOffset(coarse_s, reach_s / 5, at.correlation)
@@ -266,18 +270,27 @@ def offset_over(
         if _is_small_step(fit.offset_s, offset_s, settled_s, negligible_s):
             before = rate
             rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], before)
-            is_settled = abs(rate.used - before.used) * child.duration_s < settled_s
+            is_settled = (
+                abs(rate.used - before.used) * child.duration_s < settled_s
+            )
             if is_settled and (max_pairs > MAX_PAIRS or not rate.is_used):
                 break
     estimate = TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit)
-    return replace(estimate, rate=rate) if np.isfinite(rate.sigma_ppm) else estimate
+    return (
+        replace(estimate, rate=rate)
+        if np.isfinite(rate.sigma_ppm)
+        else estimate
+    )
 
 
 def _is_small_step(
     step_s: float, offset_s: float, settled_s: float, negligible_s: float
 ) -> bool:
     """Whether the last step ends the iteration: small in itself, or of a negligible offset."""
-    return abs(step_s) < settled_s or abs(offset_s) + abs(step_s) < negligible_s / 2
+    return (
+        abs(step_s) < settled_s
+        or abs(offset_s) + abs(step_s) < negligible_s / 2
+    )
 
 
 def _unknown_rate(child: Trajectory) -> ClockRate:
@@ -305,7 +318,9 @@ def _fit_of(
 
     ``max_unexplained`` is that of :func:`offset_over`. If it is given, there is only one attempt.
     """
-    fit = fit_similarity(pairs, twists, start=start, max_unexplained=max_unexplained)
+    fit = fit_similarity(
+        pairs, twists, start=start, max_unexplained=max_unexplained
+    )
     if fit.explains_translation or max_unexplained is not None:
         return fit
     # The motion does not determine the scale if the body rotates about one of its sensors.
@@ -321,13 +336,17 @@ def _twists_of_pairs(
     ``stamps_ns`` are those of the pose pairs. See :func:`_twists`.
     """
     # Motions share poses: the velocity at each pose is computed once.
-    poses, index_of_pose = np.unique(np.r_[pairs.i, pairs.j], return_inverse=True)
+    poses, index_of_pose = np.unique(
+        np.r_[pairs.i, pairs.j], return_inverse=True
+    )
     twists = _twists(child, stamps_ns[poses], span_s)[index_of_pose]
     at_starts, at_ends = np.split(twists, 2)
     return at_starts, at_ends
 
 
-def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> FloatArray:
+def _twists(
+    trajectory: Trajectory, stamps_ns: IntArray, span_s: float
+) -> FloatArray:
     """Return velocities (N, 6), m/s and rad/s, of a sensor in its own frame at stamps (N,).
 
     A velocity is the mean from ``span_s`` seconds before to ``span_s`` seconds after a stamp; less
@@ -337,13 +356,17 @@ def _twists(trajectory: Trajectory, stamps_ns: IntArray, span_s: float) -> Float
     first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
     from_ns = np.clip(stamps_ns - span_ns, first_ns, last_ns)
     until_ns = np.clip(stamps_ns + span_ns, first_ns, last_ns)
-    before, after = np.split(trajectory.at(np.concatenate([from_ns, until_ns])), 2)
+    before, after = np.split(
+        trajectory.at(np.concatenate([from_ns, until_ns])), 2
+    )
     steps = se3.log(se3.inverse(before) @ after)
     spans_s = (until_ns - from_ns) * 1e-9
     return steps / spans_s[:, None]
 
 
-def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRate:
+def _rate(
+    fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate
+) -> ClockRate:
     """Estimate the clock rate from the offsets of a fit in blocks of time.
 
     The slope of a line through these offsets is a correction of ``before``. The variance of the
@@ -379,4 +402,6 @@ def _rate(fit: SimilarityFit, stamps_ns: IntArray, before: ClockRate) -> ClockRa
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
     sigma = float(np.sqrt(variance))
     is_used = abs(total) > _MIN_RATE_SIGMAS * sigma
-    return replace(before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used)
+    return replace(
+        before, ppm=1e6 * total, sigma_ppm=1e6 * sigma, is_used=is_used
+    )

@@ -150,18 +150,24 @@ def agreement_of(
         Probability of reporting a difference between results of one extrinsic.
     """
     usual_scatter = np.zeros(6) if usual is None else usual
-    stated = np.array([_without_unknown(covariance) for covariance in covariances])
+    stated = np.array(
+        [_without_unknown(covariance) for covariance in covariances]
+    )
     scattered = stated + np.diag(usual_scatter**2)
     weights = np.linalg.inv(scattered)
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
     no_scatter = np.zeros(6)
     first_guess = Ts_parent_child[best]
-    of_all = _common(Ts_parent_child, np.linalg.inv(weights), no_scatter, first_guess)
+    of_all = _common(
+        Ts_parent_child, np.linalg.inv(weights), no_scatter, first_guess
+    )
     start = of_all.T_parent_child
     errors = deviation(Ts_parent_child, start)
     explanation = _explain(errors, weights, level)
     belongs = ~explanation.apart
-    common = _common(Ts_parent_child[belongs], stated[belongs], usual_scatter, start)
+    common = _common(
+        Ts_parent_child[belongs], stated[belongs], usual_scatter, start
+    )
     rest = _explain(errors[belongs], weights[belongs], 0.0)
     sigmas = np.sqrt(np.diagonal(scattered, axis1=1, axis2=2))
     sigmas = np.where(sigmas < UNOBSERVABLE, sigmas, np.nan)
@@ -271,7 +277,9 @@ class _Explanation(NamedTuple):
     p_value: float
 
 
-def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanation:
+def _explain(
+    errors: FloatArray, weights: FloatArray, level: float
+) -> _Explanation:
     """Explain errors (N, 6) of results with weights (N, 6, 6).
 
     Three or more results are split into two groups with a mean each. The first group is a single
@@ -302,7 +310,9 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
     )
     products = Blocks(np.swapaxes(design, 1, 2) @ weights @ design)
     ranks = Blocks(_ranks(weights))
-    total_chi2, total_dof = map(float, _chi2_and_dof(products.total, ranks.total))
+    total_chi2, total_dof = map(
+        float, _chi2_and_dof(products.total, ranks.total)
+    )
     p_value = float(chdtrc(total_dof, total_chi2)) if total_dof else 1.0
     kind = "differ" if p_value < _LEVEL else "agree"
     apart = np.zeros(n_results, dtype=bool)
@@ -326,7 +336,9 @@ def _explain(errors: FloatArray, weights: FloatArray, level: float) -> _Explanat
     return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
 
 
-def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> FloatArray:
+def _p_values_of_splits(
+    products: Blocks, ranks: Blocks, since: IntArray
+) -> FloatArray:
     """Return the p-values (N + S,) of splits of N results into two groups.
 
     The p-value is the larger of two tests: the chi-square test of the reduction of chi-square, and
@@ -341,7 +353,9 @@ def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> Flo
     """
     from scipy.special import chdtrc, fdtrc
 
-    total_chi2, total_dof = map(float, _chi2_and_dof(products.total, ranks.total))
+    total_chi2, total_dof = map(
+        float, _chi2_and_dof(products.total, ranks.total)
+    )
     group = np.concatenate([products.sums, products.since(since)])
     group_ranks = np.concatenate([ranks.sums, ranks.since(since)])
     group_chi2, group_dof = _chi2_and_dof(group, group_ranks)
@@ -356,7 +370,9 @@ def _p_values_of_splits(products: Blocks, ranks: Blocks, since: IntArray) -> Flo
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = gained / spent / (chi2 / dof)
         by_scatter_of_others = fdtrc(spent, dof, ratios)
-    p_values = np.where(dof > 0, np.fmax(p_values, by_scatter_of_others), p_values)
+    p_values = np.where(
+        dof > 0, np.fmax(p_values, by_scatter_of_others), p_values
+    )
     p_values[spent <= 0] = 1.0
     return p_values
 

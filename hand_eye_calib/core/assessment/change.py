@@ -91,14 +91,19 @@ class Moved:
             difference = amount(axis, self.axes[axis].difference)
             sigma = amount(axis, self.axes[axis].sigma)
             moves.append(f"{axis} by {difference} +/- {sigma}")
-        return listing(moves) or "by what the axes show together, none of them alone"
+        return (
+            listing(moves)
+            or "by what the axes show together, none of them alone"
+        )
 
     def _most_different_axes(self) -> list[str]:
         """Return the two axes that differ most, in standard deviations."""
         ratios = {}
         for axis in AXES:
             if axis in self.axes:
-                ratios[axis] = abs(self.axes[axis].difference) / self.axes[axis].sigma
+                ratios[axis] = (
+                    abs(self.axes[axis].difference) / self.axes[axis].sigma
+                )
         different = [axis for axis, ratio in ratios.items() if ratio]
         return sorted(different, key=lambda axis: -ratios[axis])[:2]
 
@@ -109,7 +114,9 @@ class Moved:
             rows = [self.axes[axis] for axis in axes]
             sigma = max(row.sigma for row in rows)
             if math.isfinite(sigma):
-                total = amount(axes[0], math.hypot(*(row.difference for row in rows)))
+                total = amount(
+                    axes[0], math.hypot(*(row.difference for row in rows))
+                )
                 totals.append(f"{total} +/- {amount(axes[0], sigma)}")
         return totals
 
@@ -123,7 +130,9 @@ class Moved:
         return f"a change of {' or '.join(changes)} would have been seen"
 
 
-def moved(values: FloatArray, covariance: FloatArray, limits: FloatArray) -> Moved:
+def moved(
+    values: FloatArray, covariance: FloatArray, limits: FloatArray
+) -> Moved:
     """Test a difference of two estimates of an extrinsic.
 
     Parameters

@@ -88,7 +88,9 @@ def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
         Variance of this scale, by the data alone.
     """
     # The harmonic sum of the prior's and the data's variance.
-    open_variance = FLOOR_SCALE**2 * scale_variance / (FLOOR_SCALE**2 + scale_variance)
+    open_variance = (
+        FLOOR_SCALE**2 * scale_variance / (FLOOR_SCALE**2 + scale_variance)
+    )
     return open_variance * np.outer(by_scale, by_scale)
 
 
@@ -123,13 +125,19 @@ def floor_of_pairs(
     weight_of_pair = weights[:, None, None]
     products = multiplied(weight_of_pair * columns, columns)
     information = products[:6, :6].copy()
-    information[3:, 3:] += 2 * multiplied(weight_of_pair * of_rotation, of_rotation)
+    information[3:, 3:] += 2 * multiplied(
+        weight_of_pair * of_rotation, of_rotation
+    )
     coupling = products[:6, 6]
-    covariance = np.linalg.pinv(information, rcond=_MIN_INFORMATION, hermitian=True)
+    covariance = np.linalg.pinv(
+        information, rcond=_MIN_INFORMATION, hermitian=True
+    )
     by_scale = covariance @ coupling
     scale_information = max(float(products[6, 6] - coupling @ by_scale), 1e-30)
     overlap = float(np.mean(pairs.j - pairs.i)) if len(pairs) else 1.0
     n_surplus = max(3.0 * float(weights.sum()) - 7.0, 1.0)
     variance = overlap * products[7, 7] / n_surplus
     scale_variance = float(variance / scale_information)
-    return common_mode_floor(speed_m_s) + open_scale_floor(by_scale, scale_variance)
+    return common_mode_floor(speed_m_s) + open_scale_floor(
+        by_scale, scale_variance
+    )

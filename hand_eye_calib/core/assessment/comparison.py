@@ -9,7 +9,10 @@ import numpy as np
 
 from hand_eye_calib.core.assessment.agreement import Agreement, agreement_of
 from hand_eye_calib.core.assessment.change import UNKNOWN, Change, moved
-from hand_eye_calib.core.assessment.moved import scatter_in_words, scatter_of_recordings
+from hand_eye_calib.core.assessment.moved import (
+    scatter_in_words,
+    scatter_of_recordings,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import listing
@@ -65,7 +68,9 @@ def compare(
     require_type("results", results, Sequence)
     for result in results:
         require_type("each result", result, Calibration)
-    if installed is not None and not isinstance(installed, Calibration | Extrinsic):
+    if installed is not None and not isinstance(
+        installed, Calibration | Extrinsic
+    ):
         raise InputError(
             "installed must be an earlier result, such as hec.load(DIR); got "
             f"{type(installed).__name__}. For another source, run hand_eye_calib compare DIR "
@@ -112,15 +117,18 @@ def _comparison_with_installed(
     elif moved_names:
         sentence = f"moved: {listing(moved_names)} of {len(differences)}"
     else:
-        sentence = (
-            f"{verdict}: none of {len(differences)} differs from what is installed"
-        )
+        sentence = f"{verdict}: none of {len(differences)} differs from what is installed"
     return Comparison(
-        sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
+        sentence=sentence,
+        verdict=verdict,
+        moved=moved_names,
+        differences=differences,
     )
 
 
-def _comparison_with_each_other(by_name: Mapping[str, Calibration]) -> Comparison:
+def _comparison_with_each_other(
+    by_name: Mapping[str, Calibration],
+) -> Comparison:
     """Compare the results of several recordings of one rig."""
     differences = _differences([*combinations(by_name.items(), 2)])
     verdict = _verdict_of(differences)
@@ -132,7 +140,10 @@ def _comparison_with_each_other(by_name: Mapping[str, Calibration]) -> Compariso
     else:
         sentence = f"{verdict}: none of {len(by_name)} differs from another"
     return Comparison(
-        sentence=sentence, verdict=verdict, moved=moved_names, differences=differences
+        sentence=sentence,
+        verdict=verdict,
+        moved=moved_names,
+        differences=differences,
     )
 
 
@@ -162,7 +173,9 @@ def _by_name(
         names = [f"result {number}" for number in range(1, len(results) + 1)]
     by_name = dict(zip(names, results, strict=False))
     if len(by_name) < len(results):
-        twice = next(name for name, count in Counter(names).items() if count > 1)
+        twice = next(
+            name for name, count in Counter(names).items() if count > 1
+        )
         raise InputError(f"{twice} appears twice: name each result once")
     return by_name
 
@@ -192,7 +205,9 @@ def with_comparison(
     result: Calibration, installed: Calibration | Extrinsic
 ) -> Calibration:
     """Return a copy of a result that contains its comparison with the installed extrinsic."""
-    origin = "a result" if isinstance(installed, Calibration) else installed.origin
+    origin = (
+        "a result" if isinstance(installed, Calibration) else installed.origin
+    )
     values = by_axis(xyz_rpy(installed.T_parent_child))
     comparison = compare([result], installed, ["result"])
     return replace(
@@ -208,7 +223,9 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     if not (_is_from_motion(before) and _is_from_motion(after)):
         # Constant sensor errors cancel between two estimates from motion, but not here. The
         # allowance covers them; on axes where the scatter is larger, the scatter is used instead.
-        scatter = allowance + np.diag(np.maximum(np.diag(scatter - allowance), 0.0))
+        scatter = allowance + np.diag(
+            np.maximum(np.diag(scatter - allowance), 0.0)
+        )
     values = deviation(after.T_parent_child, before.T_parent_child)
     limits = SEEN_TARGETS * np.array([target_of(axis, after) for axis in AXES])
     difference = moved(values, covariance + scatter, limits)
@@ -254,7 +271,8 @@ def _covariances(extrinsic: Calibration | Extrinsic) -> FloatArray:
         covariance = turned(rotation, measured)
     if isinstance(extrinsic, Calibration):
         is_hidden = [
-            dof.verdict is DofVerdict.UNOBSERVABLE for dof in extrinsic.observability
+            dof.verdict is DofVerdict.UNOBSERVABLE
+            for dof in extrinsic.observability
         ]
         covariance = covariance + np.diag(np.where(is_hidden, UNKNOWN**2, 0.0))
     scatter = np.zeros((6, 6))
@@ -274,7 +292,9 @@ def agreement_of_results(
     Ts = np.array([result.T_parent_child for result in results])
     in_child = np.array([result.covariance_measured for result in results])
     in_parent = turned(se3.rotation_of(Ts), in_child)
-    variances = [np.diag(scatter_of_recordings(covariance)) for covariance in in_parent]
+    variances = [
+        np.diag(scatter_of_recordings(covariance)) for covariance in in_parent
+    ]
     # The usual scatter of the rig: the median over its recordings.
     usual_scatter = np.sqrt(np.median(variances, axis=0))
     return agreement_of(Ts, in_parent, usual_scatter, level)
@@ -282,7 +302,9 @@ def agreement_of_results(
 
 def require_same_frames(results: Iterable[Calibration]) -> None:
     """Raise InputError if results are for different pairs of frames."""
-    frames = {f"{result.child_frame} in {result.parent_frame}" for result in results}
+    frames = {
+        f"{result.child_frame} in {result.parent_frame}" for result in results
+    }
     if len(frames) > 1:
         raise InputError(
             f"expected results of one pair of frames; found {' and '.join(sorted(frames))}: "

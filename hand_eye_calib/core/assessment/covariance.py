@@ -151,7 +151,9 @@ def assess(
     return combined(T_parent_child, covariance, unknown)
 
 
-def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assessment:
+def assess_adaptive(
+    pose_pairs: PosePairs, solution: AdaptiveSolution
+) -> Assessment:
     """Assess a solution of the adaptive estimator for these poses."""
     T_parent_child = solution.T_parent_child
     covariance = widened_by_blocks(
@@ -173,7 +175,9 @@ def assess_adaptive(pose_pairs: PosePairs, solution: AdaptiveSolution) -> Assess
     return combined(T_parent_child, covariance, unknown)
 
 
-def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessment:
+def assess_rotation(
+    Ts_pw_p: FloatArray, solution: AdaptiveSolution
+) -> Assessment:
     """Assess a solution of the adaptive estimator from rotations alone.
 
     The translation is unknown. If the sensors rotate about only one axis, the rotation about this
@@ -195,7 +199,10 @@ def assess_rotation(Ts_pw_p: FloatArray, solution: AdaptiveSolution) -> Assessme
         if np.linalg.norm(phi) > _SHARE_OF_ROTATION
     ]
     lone_axes = _hidden_by_noise(
-        Ts_pw_p, solution.T_parent_child, solution.jumps, solution.rotation_variance
+        Ts_pw_p,
+        solution.T_parent_child,
+        solution.jumps,
+        solution.rotation_variance,
     )
     translations = np.eye(6)[:3]
     rotations = [np.r_[np.zeros(3), phi] for phi in (*unseen, *lone_axes)]
@@ -225,7 +232,9 @@ def assess_lever_arm(
         Covariance that possible faults of the positions add.
     """
     whole = np.zeros((6, 6))
-    whole[:3, :3] = widened_by_blocks(covariance, solution, slice(0, 3)) + of_faults
+    whole[:3, :3] = (
+        widened_by_blocks(covariance, solution, slice(0, 3)) + of_faults
+    )
     white = _white_rotation_variance(se3.rotation_of(Ts))
     walk = np.exp(solution.levels[WALK_ROTATION])
 
@@ -276,7 +285,9 @@ def widened_by_blocks(
     blocks = Blocks(solution.part_products).merged(BLOCKS)
     answers = NormalEquations(blocks.without()).step
     spread = jackknife_covariance(answers[:, part])
-    factors = np.full(len(covariance), max(_mean_ratio(spread, covariance), 1.0))
+    factors = np.full(
+        len(covariance), max(_mean_ratio(spread, covariance), 1.0)
+    )
     if len(covariance) == 6:
         rotation_ratio = _mean_ratio(spread[3:, 3:], covariance[3:, 3:])
         factors[3:] = np.maximum(factors[3:], rotation_ratio)
@@ -318,7 +329,9 @@ def _hidden_by_noise(
     jumps_before = np.concatenate([[0], np.cumsum(jumps)])
     candidates: list[FloatArray] = []
     for baseline in baselines[::-1].tolist():
-        motions = se3.relative_rotations(rotations[:-baseline], rotations[baseline:])
+        motions = se3.relative_rotations(
+            rotations[:-baseline], rotations[baseline:]
+        )
         # Motions across a jump have weight zero, unless every motion is across a jump.
         is_without_jump = jumps_before[baseline:] == jumps_before[:-baseline]
         weights = is_without_jump.astype(float)
@@ -393,7 +406,8 @@ def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     # The direction of an unobservable translation is this axis already. A second, slightly
     # different direction would make another axis unobservable.
     if any(
-        dof.verdict is DofVerdict.UNOBSERVABLE for dof in assessment.observability[:3]
+        dof.verdict is DofVerdict.UNOBSERVABLE
+        for dof in assessment.observability[:3]
     ):
         return assessment
     in_child = se3.rotation_of(assessment.T_parent_child).T @ axis
@@ -446,11 +460,15 @@ def model_covariance(
 
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
-    rounding = max(_RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2)
+    rounding = max(
+        _RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2
+    )
     is_seen = values > rounding
     inverse_values = np.divide(1.0, values, out=np.zeros(6), where=is_seen)
     inverse = (vectors * inverse_values) @ vectors.T
-    score_covariance = variance_t * information_t + 4 * variance_r * information_r
+    score_covariance = (
+        variance_t * information_t + 4 * variance_r * information_r
+    )
     covariance = inverse @ score_covariance @ inverse
 
     products = lever_arm_products(jacobian_t[..., :3], weights)
@@ -501,7 +519,9 @@ def lever_arm_products(
 
 
 def _hidden_directions(
-    products: FloatArray, cov_rotation: FloatArray, least_share: float = _MIN_SHARE
+    products: FloatArray,
+    cov_rotation: FloatArray,
+    least_share: float = _MIN_SHARE,
 ) -> FloatArray:
     """Return the directions (3, U) of lever arms that rotations do not reveal.
 
@@ -544,14 +564,18 @@ def hidden_axes(
         cov_rotation = np.zeros((3, 3))
     directions = _hidden_directions(products, cov_rotation)
     shares = (directions**2).sum(axis=1)
-    return tuple("xyz"[index] for index in np.flatnonzero(shares > _HIDDEN_SHARE))
+    return tuple(
+        "xyz"[index] for index in np.flatnonzero(shares > _HIDDEN_SHARE)
+    )
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:
     """Return an orthonormal basis (6, U) of directions (6,), which may be linearly dependent."""
     if not directions:
         return np.zeros((6, 0))
-    vectors, sizes, _ = np.linalg.svd(np.array(directions).T, full_matrices=False)
+    vectors, sizes, _ = np.linalg.svd(
+        np.array(directions).T, full_matrices=False
+    )
     return vectors[:, sizes > 1e-6 * sizes[0]]
 
 

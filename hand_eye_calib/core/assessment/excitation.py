@@ -5,7 +5,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
+from hand_eye_calib.core.assessment.covariance import (
+    hidden_axes,
+    lever_arm_products,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.base.text import axes_in_words
@@ -38,14 +41,16 @@ _ALONG_ONE_AXIS = 0.9
 # Steps below this share of the median length are noise and have no direction.
 _LONG_STEP = 0.3
 # Manoeuvres that turn a vehicle about its x, y and z.
-_MANOEUVRES = ("one wheel over a kerb", "over a ramp or a bump", "curves to both sides")
+_MANOEUVRES = (
+    "one wheel over a kerb",
+    "over a ramp or a bump",
+    "curves to both sides",
+)
 
 # Advice about the height of a vehicle that has only turned about its vertical axis, and what a
 # recording, but no live session, may contain in addition.
 _ON_A_FLAT_FLOOR = "drive over a ramp or a kerb, or measure it by hand"
-_WITH_LIDARS = (
-    ", or, if both sensors are lidars, record their clouds and run calibrate on the bag"
-)
+_WITH_LIDARS = ", or, if both sensors are lidars, record their clouds and run calibrate on the bag"
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,9 @@ class Excitation:
     @property
     def has_vehicle_axes(self) -> bool:
         """Whether the sensor moves along x and turns about z, as in REP 103."""
-        turns_about_z = self.rotation[2] >= max(self.rotation.max(), MIN_ROTATION)
+        turns_about_z = self.rotation[2] >= max(
+            self.rotation.max(), MIN_ROTATION
+        )
         moves_along_x = abs(self.forward[0]) > _ALONG_ONE_AXIS
         return bool(self.drives and turns_about_z and moves_along_x)
 
@@ -107,7 +114,9 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
     orientations = se3.rotation_of(poses)
     lag = 1
     while lag < len(poses):
-        motions = se3.relative_rotations(orientations[:-lag], orientations[lag:])
+        motions = se3.relative_rotations(
+            orientations[:-lag], orientations[lag:]
+        )
         angles = np.abs(se3.rotation_log(motions))
         typical_angles = [quantile(angle, _QUANTILE) for angle in angles.T]
         rotation = np.maximum(rotation, typical_angles)
@@ -115,7 +124,9 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
         if np.trace(products) > np.trace(lever_arms):
             lever_arms = products
         lag *= 2
-    directions = [_main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)]
+    directions = [
+        _main_direction(poses, lag) for lag in (1, 2, 4) if lag < len(poses)
+    ]
     share, forward = max(directions, key=lambda direction: direction[0])
     steps = np.diff(se3.translation_of(poses), axis=0)
     return Excitation(
@@ -174,7 +185,9 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
     return float(durations_s[is_moving].sum())
 
 
-def what_is_missing(seen: Excitation, calibration: Calibration | None = None) -> str:
+def what_is_missing(
+    seen: Excitation, calibration: Calibration | None = None
+) -> str:
     """Describe what the motion so far does not determine, and the motion that would.
 
     Parameters
@@ -266,7 +279,9 @@ def _motion_for(name: str, seen: Excitation) -> str:
     return hint
 
 
-def _motion_for_only_axis(name: str, others: Sequence[int], seen: Excitation) -> str:
+def _motion_for_only_axis(
+    name: str, others: Sequence[int], seen: Excitation
+) -> str:
     """Describe the motion that reveals the only axis that all rotation so far is about.
 
     ``others`` are the indices of the other two axes.

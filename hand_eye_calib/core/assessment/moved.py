@@ -42,7 +42,11 @@ from hand_eye_calib.core.base.blocks import (
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import NormalEquations
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 
 # Prior standard deviation of a shift, per axis of translation (m) and of rotation (rad).
 _SHIFT_M = 0.03
@@ -128,7 +132,9 @@ _EXPECTED_SHIFTS = shift_covariance()
 SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
 
 
-def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArray:
+def log_ratio(
+    tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS
+) -> FloatArray:
     """Return the log likelihood ratio (...) of a shift against none.
 
     Parameters
@@ -148,7 +154,9 @@ def log_ratio(tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS) -> FloatArra
 def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
     # NumPy 1 reads S as vectors, not as columns, if H and S differ in their number of dimensions.
-    columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[..., None]
+    columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[
+        ..., None
+    ]
     try:
         solved = np.linalg.solve(H, columns)
     except np.linalg.LinAlgError:
@@ -166,7 +174,9 @@ def most_likely(tables: FloatArray, ridge: float) -> FloatArray:
     return _solve(regular, score(tables))
 
 
-def squares_about(tables: FloatArray, shifts: FloatArray, ridge: float) -> FloatArray:
+def squares_about(
+    tables: FloatArray, shifts: FloatArray, ridge: float
+) -> FloatArray:
     """Return squared Mahalanobis distances (...) of estimated shifts from ``shifts`` (..., 6).
 
     ``tables`` (..., 6, 7) are ``[H S]`` of the estimates. ``ridge`` is the weight of the prior, as
@@ -217,11 +227,16 @@ def residuals_and_jacobians(
     Bs_predicted = (
         se3.inverse(T_parent_child) @ pairs.Ts_parenti_parentj @ T_parent_child
     )
-    return se3.log(Bs_inverse @ Bs_predicted), np.eye(6) - se3.adjoint(Bs_inverse)
+    return se3.log(Bs_inverse @ Bs_predicted), np.eye(6) - se3.adjoint(
+        Bs_inverse
+    )
 
 
 def evidence(
-    residuals: FloatArray, jacobians: FloatArray, noise: FloatArray, weights: FloatArray
+    residuals: FloatArray,
+    jacobians: FloatArray,
+    noise: FloatArray,
+    weights: FloatArray,
 ) -> FloatArray:
     """Return information and score ``[H S]`` (K, p, p + 1) of each motion pair on p parameters.
 
@@ -327,11 +342,15 @@ def _worst_long_run_variance(blocks: Blocks) -> float | None:
     few seconds.
     """
     counts = [
-        count for count in _WINDOW_COUNTS if len(blocks.sums) >= count * _MIN_WINDOW_S
+        count
+        for count in _WINDOW_COUNTS
+        if len(blocks.sums) >= count * _MIN_WINDOW_S
     ]
     if not counts:
         return None
-    return max(1.0, *(_long_run_variance(blocks.merged(count)) for count in counts))
+    return max(
+        1.0, *(_long_run_variance(blocks.merged(count)) for count in counts)
+    )
 
 
 def _long_run_variance(windows: Blocks) -> float:
@@ -342,7 +361,9 @@ def _long_run_variance(windows: Blocks) -> float:
     variance over all times is returned.
     """
     n_windows = len(windows.sums)
-    cuts = np.arange(_MIN_WINDOWS_PER_SIDE, n_windows - _MIN_WINDOWS_PER_SIDE + 1)
+    cuts = np.arange(
+        _MIN_WINDOWS_PER_SIDE, n_windows - _MIN_WINDOWS_PER_SIDE + 1
+    )
     sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
     estimates = most_likely(sides, _PRIOR_SHARE)
     side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
@@ -411,14 +432,17 @@ def possible_shift(
         One warning if a shift is more likely than not, even after the scatter between recordings is
         added to the covariances; else empty.
     """
-    cuts = np.arange(_MIN_PARTS_PER_SIDE, len(products) - _MIN_PARTS_PER_SIDE + 1)
+    cuts = np.arange(
+        _MIN_PARTS_PER_SIDE, len(products) - _MIN_PARTS_PER_SIDE + 1
+    )
     before = NormalEquations(Blocks(products).before(cuts))
     after = NormalEquations(Blocks(products).since(cuts))
     is_complete = before.is_complete & after.is_complete
     if not is_complete.any():
         return np.zeros((6, 6)), ()
     covariances = (
-        max(misfit, 1.0) * (before.covariance + after.covariance)[is_complete, :6, :6]
+        max(misfit, 1.0)
+        * (before.covariance + after.covariance)[is_complete, :6, :6]
     )
     steps = (after.step - before.step)[is_complete, :6]
     tables = answer_evidence(steps, covariances)
@@ -430,7 +454,9 @@ def possible_shift(
     weights = np.exp(ratios - ratios.max())
     squared = np.einsum("k,ki,kj->ij", weights / weights.sum(), shifts, shifts)
     spread = probability * squared / 4.0
-    scattered = covariances + scatter_of_recordings(covariances[len(covariances) // 2])
+    scattered = covariances + scatter_of_recordings(
+        covariances[len(covariances) // 2]
+    )
     if _probability(log_ratio(answer_evidence(steps, scattered))) < 0.5:
         return spread, ()
     best = int(np.argmax(ratios))

@@ -81,12 +81,16 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     motion_sigmas = sigmas_in_parent(se3.rotation_of(start), covariance)
     are_halved = halves_variance(sigmas, motion_sigmas)
     verdicts = []
-    for axis, sigma, is_halved in zip(AXES, sigmas.tolist(), are_halved, strict=True):
+    for axis, sigma, is_halved in zip(
+        AXES, sigmas.tolist(), are_halved, strict=True
+    ):
         # The value of an axis is mostly the prior's if the prior at least halves its variance.
         is_from_prior = axis in prior and bool(is_halved)
         verdicts.append(_verdict_on(axis, sigma, is_from_prior))
     from_motion = whitening.root @ whitened_covariance @ whitening.inverse_root
-    return Assessment(T, posterior, tuple(verdicts), contradictions, from_motion)
+    return Assessment(
+        T, posterior, tuple(verdicts), contradictions, from_motion
+    )
 
 
 def _unknown_directions(covariance: FloatArray) -> FloatArray:
@@ -143,7 +147,9 @@ def _minimum(
     return T, normal
 
 
-def _verdict_on(axis: str, sigma: float, is_from_prior: bool) -> DofObservability:
+def _verdict_on(
+    axis: str, sigma: float, is_from_prior: bool
+) -> DofObservability:
     """Return the verdict on an axis by its standard deviation and the origin of its value."""
     verdict = judged(axis, sigma)
     is_observable = verdict.verdict is not DofVerdict.UNOBSERVABLE
@@ -159,7 +165,9 @@ def halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
 
 def widened(assessment: Assessment, spread: FloatArray) -> Assessment:
     """Return an assessment with an added covariance (6, 6) of (rho, phi), in the child's frame."""
-    added_sigmas = sigmas_in_parent(se3.rotation_of(assessment.T_parent_child), spread)
+    added_sigmas = sigmas_in_parent(
+        se3.rotation_of(assessment.T_parent_child), spread
+    )
     observability = []
     for dof, added in zip(assessment.observability, added_sigmas, strict=True):
         if dof.verdict is not DofVerdict.UNOBSERVABLE:
@@ -182,13 +190,19 @@ def _whitened(
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known_directions = vectors[:, values < 0.5]
-    variances, axes = np.linalg.eigh(known_directions.T @ covariance @ known_directions)
+    variances, axes = np.linalg.eigh(
+        known_directions.T @ covariance @ known_directions
+    )
     known_sigmas = np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
     is_translation = (unknown[:3] ** 2).sum(axis=0) > 0.5
-    unknown_sigmas = np.where(is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1])
+    unknown_sigmas = np.where(
+        is_translation, UNKNOWN_SIGMAS[0], UNKNOWN_SIGMAS[-1]
+    )
     directions = np.concatenate([known_directions @ axes, unknown], axis=1)
     sigmas = np.concatenate([known_sigmas, unknown_sigmas])
-    in_child = se3.rotation_of(T_parent_child).T @ se3.translation_of(T_parent_child)
+    in_child = se3.rotation_of(T_parent_child).T @ se3.translation_of(
+        T_parent_child
+    )
     to_zero = -(unknown[:3].T @ in_child)
     unknown_targets = np.where(is_translation, to_zero, 0.0) / unknown_sigmas
     return _Whitening(
@@ -198,7 +212,9 @@ def _whitened(
     )
 
 
-def _prior_residuals(T: FloatArray, prior: Prior) -> tuple[FloatArray, FloatArray]:
+def _prior_residuals(
+    T: FloatArray, prior: Prior
+) -> tuple[FloatArray, FloatArray]:
     """Return weighted residuals (P,) of the prior, and their derivatives (P, 6) by (rho, phi)."""
     residuals = _weighted(T, prior)
     jacobian = np.zeros((len(prior), 6))
@@ -228,7 +244,10 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
             # The phase of a complex number is between -pi and pi.
             errors[axis] = np.angle(np.exp(1j * (rpy[axis] - angle)))
     return np.array(
-        [errors[axis] / max(sigma, _SMALL) for axis, (_, sigma) in prior.items()]
+        [
+            errors[axis] / max(sigma, _SMALL)
+            for axis, (_, sigma) in prior.items()
+        ]
     )
 
 
@@ -246,7 +265,9 @@ def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:
     for axis, distance in zip(prior, distances.tolist(), strict=True):
         is_far = distance > _MAX_DISTANCE
         if verdicts[axis] is DofVerdict.UNOBSERVABLE:
-            is_far = axis in TRANSLATIONS and abs(prior[axis][0]) > _MAX_LEVER_ARM
+            is_far = (
+                axis in TRANSLATIONS and abs(prior[axis][0]) > _MAX_LEVER_ARM
+            )
         if is_far:
             contradictions[axis] = distance
     return contradictions

@@ -49,7 +49,9 @@ class ReferenceChoice:
 
 
 def select_reference(
-    pose_pairs: PosePairs, method: Method, solution: AdaptiveSolution | None = None
+    pose_pairs: PosePairs,
+    method: Method,
+    solution: AdaptiveSolution | None = None,
 ) -> ReferenceChoice:
     """Choose the reference for a method.
 
@@ -76,8 +78,12 @@ def select_reference(
             f"found {len(pose_pairs)}; record longer, or name a reference such as B1"
         )
     poses = pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c
-    solution = solution or estimator.solve(pose_pairs.stamps_ns, *poses, quick=True)
-    information = np.linalg.pinv(solution.cov_parent_child_in_child, hermitian=True)
+    solution = solution or estimator.solve(
+        pose_pairs.stamps_ns, *poses, quick=True
+    )
+    information = np.linalg.pinv(
+        solution.cov_parent_child_in_child, hermitian=True
+    )
     back = se3.inverse(solution.T_parent_child)
     distances: dict[str, float] = {}
     for reference in _CANDIDATES:

@@ -88,7 +88,9 @@ def _products(rotations: FloatArray, baseline: int) -> FloatArray:
     baseline : int
         Number of poses from the start to the end of a motion.
     """
-    motions = se3.relative_rotations(rotations[:-baseline], rotations[baseline:])
+    motions = se3.relative_rotations(
+        rotations[:-baseline], rotations[baseline:]
+    )
     return lever_arm_products(motions - np.eye(3))
 
 
@@ -129,7 +131,9 @@ def _explained(stamps_ns: IntArray, Ts: FloatArray, axis: FloatArray) -> float:
     rotations = se3.rotation_of(Ts)
     positions = se3.translation_of(Ts)
     second_differences = (
-        positions[2 * span :] - 2.0 * positions[span:-span] + positions[: -2 * span]
+        positions[2 * span :]
+        - 2.0 * positions[span:-span]
+        + positions[: -2 * span]
     )
     in_world = second_differences / (span * step_s) ** 2
     accelerations = np.einsum("nji,nj->ni", rotations[span:-span], in_world)

@@ -68,7 +68,9 @@ def assess_robust(pairs: MotionPairs, solution: RobustSolution) -> Assessment:
     )
 
 
-def excess_covariance(answer: Assessment, opinions: Sequence[Assessment]) -> FloatArray:
+def excess_covariance(
+    answer: Assessment, opinions: Sequence[Assessment]
+) -> FloatArray:
     """Return the covariance that the noise model misses, estimated from second opinions.
 
     Parameters
@@ -90,11 +92,17 @@ def excess_covariance(answer: Assessment, opinions: Sequence[Assessment]) -> Flo
     sigmas = np.where(is_known, answer.sigmas, 0.0)
     excesses = []
     for opinion in opinions:
-        difference = se3.deviation(opinion.T_parent_child, answer.T_parent_child)
+        difference = se3.deviation(
+            opinion.T_parent_child, answer.T_parent_child
+        )
         expected = np.maximum(opinion.sigmas**2 - sigmas**2, 0.0)
         is_comparable = opinion.sigmas < _MAX_SIGMA_RATIO * sigmas
         excesses.append(
-            np.where(is_comparable, np.maximum(difference**2 - expected, 0.0), 0.0)
+            np.where(
+                is_comparable, np.maximum(difference**2 - expected, 0.0), 0.0
+            )
         )
     variances = medians(np.array(excesses).T)
-    return se3.turned(se3.rotation_of(answer.T_parent_child).T, np.diag(variances))
+    return se3.turned(
+        se3.rotation_of(answer.T_parent_child).T, np.diag(variances)
+    )

@@ -45,12 +45,17 @@ class Blocks:
         of the products.
         """
         n_columns = rows.shape[-1]
-        left_factors = np.array_split(rows if probes is None else probes, n_blocks)
+        left_factors = np.array_split(
+            rows if probes is None else probes, n_blocks
+        )
         right_factors = np.array_split(rows, n_blocks)
         tables = []
-        for left_rows, right_rows in zip(left_factors, right_factors, strict=True):
+        for left_rows, right_rows in zip(
+            left_factors, right_factors, strict=True
+        ):
             tables.append(
-                left_rows.reshape(-1, n_columns).T @ right_rows.reshape(-1, n_columns)
+                left_rows.reshape(-1, n_columns).T
+                @ right_rows.reshape(-1, n_columns)
             )
         return cls(np.stack(tables))
 
@@ -160,7 +165,9 @@ def shift_evidence(
     return inverse(spread) @ relative
 
 
-def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> FloatArray:
+def solve(
+    tables: FloatArray, columns: Sequence[int], target: int = -1
+) -> FloatArray:
     """Fit a target column by k other columns, by least squares.
 
     Parameters
@@ -180,7 +187,9 @@ def solve(tables: FloatArray, columns: Sequence[int], target: int = -1) -> Float
     normal = tables[..., columns, :][..., columns]
     diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
     roots = np.sqrt(np.abs(diagonal))
-    units = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > _MIN_ROOT)
+    units = np.divide(
+        1.0, roots, out=np.zeros_like(roots), where=roots > _MIN_ROOT
+    )
     balanced = normal * units[..., :, None] * units[..., None, :]
     damped = balanced + _DAMPING * np.eye(len(columns))
     scores = units * tables[..., columns, target]

@@ -96,7 +96,11 @@ METHODS = {
 def require_backend(method: str, backend: str) -> None:
     """Raise ConfigError if a method does not have a backend. The message lists those that have."""
     if backend not in METHODS[method].backends:
-        able = [name for name, record in METHODS.items() if backend in record.backends]
+        able = [
+            name
+            for name, record in METHODS.items()
+            if backend in record.backends
+        ]
         raise ConfigError(
             f"method {method} has no backend {backend}; methods with it: {' and '.join(able)}"
         )
@@ -155,7 +159,10 @@ _KIND = _both(
 
 
 _EXAMPLES = {"m": "1.85+/-0.02 or 185cm+/-2cm", "rad": "-90deg+/-2deg"}
-_UNITS_NEEDED = {"m": "More than 5 m needs its unit, as in 8m+/-0.02m. ", "rad": ""}
+_UNITS_NEEDED = {
+    "m": "More than 5 m needs its unit, as in 8m+/-0.02m. ",
+    "rad": "",
+}
 _PRIOR: dict[str, Any] = {
     axis: option(
         "",
@@ -208,7 +215,9 @@ class CalibratorConfig(OptionSet):
         "with the n-th before it), C<n> (each with the first of its segment "
         "of n), or auto (the reference with the estimate nearest to that of "
         "adaptive).",
-        parse=lambda name, value: value == "auto" or text.parse_reference(name, value),
+        parse=lambda name, value: (
+            value == "auto" or text.parse_reference(name, value)
+        ),
     )
     backend: str = option(
         "fast",
@@ -254,7 +263,10 @@ class CalibratorConfig(OptionSet):
         within=(0.0, math.pi),
     )
     keyframe_min_interval: float = option(
-        0.0, "Smallest time between kept pose pairs.", unit="s", within=(0.0, 60.0)
+        0.0,
+        "Smallest time between kept pose pairs.",
+        unit="s",
+        within=(0.0, 60.0),
     )
     max_gap: float = option(
         0.5,
@@ -343,7 +355,10 @@ class CalibratorConfig(OptionSet):
 
     def is_known(self, name: str) -> bool:
         """Return whether the user set ``time_offset`` or ``scale`` to a value, not an estimate."""
-        return name in self.given and getattr(self, name) not in ("auto", "estimate")
+        return name in self.given and getattr(self, name) not in (
+            "auto",
+            "estimate",
+        )
 
     @property
     def given_time_offset_s(self) -> float:
@@ -366,11 +381,15 @@ class CalibratorConfig(OptionSet):
         """
         words = (self.parent_measures, self.child_measures)
         # Streams that do not measure whole poses.
-        partial = [MEASURES[word] for word in words if word not in ("auto", "poses")]
+        partial = [
+            MEASURES[word] for word in words if word not in ("auto", "poses")
+        ]
         if not partial:
             return "poses"
         kinds = {measure.kind for measure in partial}
-        reasons = [measure.needs_poses for measure in partial if measure.needs_poses]
+        reasons = [
+            measure.needs_poses for measure in partial if measure.needs_poses
+        ]
         if len(kinds) == 1 and not (reasons and len(partial) == 2):
             self._require_order()
             return kinds.pop()
@@ -409,7 +428,8 @@ class CalibratorConfig(OptionSet):
         single = text.parse_targets("target.axes", self.target_axes)
         of_unit = {"m": self.target_translation, "rad": self.target_rotation}
         return tuple(
-            single.get(axis, of_unit[unit]) for axis, unit in text.AXIS_UNITS.items()
+            single.get(axis, of_unit[unit])
+            for axis, unit in text.AXIS_UNITS.items()
         )
 
     def prior(self) -> dict[str, tuple[float, float]]:

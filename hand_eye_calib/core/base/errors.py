@@ -19,7 +19,9 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(
-        letter if letter.isprintable() else letter.encode("unicode_escape").decode()
+        letter
+        if letter.isprintable()
+        else letter.encode("unicode_escape").decode()
         for letter in text
     )
 

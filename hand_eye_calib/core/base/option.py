@@ -19,7 +19,9 @@ OptionField: TypeAlias = dataclasses.Field[Any]
 LARGEST_INT = 1 << 63
 
 # A number and its unit, such as 35ms or -0.1 s.
-_NUMBER_WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)")
+_NUMBER_WITH_UNIT = re.compile(
+    r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)"
+)
 _GROUPS = ("keyframe", "prior", "target")
 _TYPE_NAMES = {
     bool: "true or false",
@@ -89,9 +91,13 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     similar = difflib.get_close_matches(word, list(candidates), n=3, cutoff=0.6)
     if not similar:
         return ""
-    n_edits = {candidate: _count_edits(word, candidate) for candidate in similar}
+    n_edits = {
+        candidate: _count_edits(word, candidate) for candidate in similar
+    }
     fewest = min(n_edits.values())
-    nearest = [candidate for candidate in similar if n_edits[candidate] == fewest]
+    nearest = [
+        candidate for candidate in similar if n_edits[candidate] == fewest
+    ]
     # A candidate with the same letters comes first: letters are swapped more often than added.
     nearest.sort(key=lambda candidate: sorted(candidate) != sorted(word))
     return f"; did you mean {' or '.join(nearest[:2])}?"
@@ -112,7 +118,10 @@ def _count_edits(word: str, other: str) -> int:
             added = distances[row, column - 1] + 1
             distance = min(replaced, removed, added)
             is_longer = row > 1 and column > 1
-            if is_longer and word[row - 2 : row] == other[column - 2 : column][::-1]:
+            if (
+                is_longer
+                and word[row - 2 : row] == other[column - 2 : column][::-1]
+            ):
                 distance = min(distance, distances[row - 2, column - 2] + 1)
             distances[row, column] = distance
     return distances[len(word), len(other)]
@@ -120,7 +129,9 @@ def _count_edits(word: str, other: str) -> int:
 
 def _of_python(value: object) -> object:
     """Return a scalar of NumPy, such as ``np.float64(0.1)``, as Python's; other values as is."""
-    is_scalar = type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
+    is_scalar = (
+        type(value).__module__ == "numpy" and getattr(value, "ndim", None) == 0
+    )
     return value.item() if is_scalar else value  # type: ignore[attr-defined]
 
 
@@ -162,7 +173,9 @@ def _expected(field: OptionField) -> str:
     words = field.metadata["words"]
     unit = field.metadata["unit"]
     expected = (
-        f"{' or '.join(words)} or a number" if words else _TYPE_NAMES[_type_of(field)]
+        f"{' or '.join(words)} or a number"
+        if words
+        else _TYPE_NAMES[_type_of(field)]
     )
     if option_name(field).startswith("prior."):
         return f"{expected} with its standard deviation, such as '1.85+/-0.02'"
@@ -174,7 +187,9 @@ def _without_unit(value: object, unit: str) -> str:
 
     ``unit`` is the unit of the option.
     """
-    match = _NUMBER_WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
+    match = (
+        _NUMBER_WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
+    )
     factors = FACTORS_TO_SI.get(unit, {})
     if match is None or match[2] not in factors:
         return ""
@@ -255,10 +270,13 @@ class OptionSet:
                 f"unknown option {unknown[0]!r}{did_you_mean(unknown[0], by_name)}; known are "
                 f"{', '.join(sorted(by_name))}"
             )
-        return cls(**{by_name[name].name: value for name, value in options.items()})
+        return cls(
+            **{by_name[name].name: value for name, value in options.items()}
+        )
 
     def to_options(self) -> dict[str, OptionValue]:
         """Return the values of all options by their public names."""
         return {
-            name: getattr(self, field.name) for name, field in self.by_name().items()
+            name: getattr(self, field.name)
+            for name, field in self.by_name().items()
         }

@@ -29,7 +29,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, Enum):
         return _plain_member(value)
     if is_dataclass(value) and not isinstance(value, type):
-        value = {field.name: getattr(value, field.name) for field in fields(value)}
+        value = {
+            field.name: getattr(value, field.name) for field in fields(value)
+        }
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -105,7 +107,9 @@ def _collection(kind: Any, value: Any) -> Any:
     if origin is tuple:
         if isinstance(value, str):
             raise TypeError("found a text in place of a list")
-        return tuple(from_plain(args[0], item) for item in _of_type(Sequence, value))
+        return tuple(
+            from_plain(args[0], item) for item in _of_type(Sequence, value)
+        )
     # From NumPy 2.5 on, the origin of an array type is NDArray; before, it is np.ndarray.
     assert origin in (np.ndarray, NDArray), kind
     return _of_type(np.ndarray, value)
@@ -121,14 +125,18 @@ def _member(kind: type[Enum], value: Any) -> Enum:
 _hints = cache(get_type_hints)
 
 
-def _record(kind: Any, value: Mapping[str, Any], names: Mapping[str, type]) -> Any:
+def _record(
+    kind: Any, value: Mapping[str, Any], names: Mapping[str, type]
+) -> Any:
     """Convert plain data to a dataclass; see :func:`from_plain`."""
     hints = get_type_hints(kind, localns=names) if names else _hints(kind)
     values = {}
     for field in fields(kind):
         if field.name in value:
             try:
-                values[field.name] = from_plain(hints[field.name], value[field.name])
+                values[field.name] = from_plain(
+                    hints[field.name], value[field.name]
+                )
             except TypeError as error:
                 raise TypeError(f"{field.name}: {error}") from None
         elif field.default is MISSING and field.default_factory is MISSING:

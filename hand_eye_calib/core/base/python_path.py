@@ -24,7 +24,9 @@ def trusted_path() -> list[str]:
     trusted.add(_PACKAGE_PARENT)
     if current in trusted:
         return [folder or current for folder in sys.path]
-    return [folder for folder in sys.path if os.path.realpath(folder) != current]
+    return [
+        folder for folder in sys.path if os.path.realpath(folder) != current
+    ]
 
 
 def trusted_environment() -> dict[str, str]:
@@ -56,4 +58,7 @@ def starting_trusted() -> Iterator[None]:
 
 
 def _settings() -> dict[str, str]:
-    return {"PYTHONPATH": os.pathsep.join(trusted_path()), "PYTHONSAFEPATH": "1"}
+    return {
+        "PYTHONPATH": os.pathsep.join(trusted_path()),
+        "PYTHONSAFEPATH": "1",
+    }

@@ -157,11 +157,15 @@ COMMANDS: Registry[Command] = Registry("command")
 ROUTES: Registry[Route] = Registry("way to calibrate")
 
 #: Sources of measurements of the extrinsic beside motion.
-BESIDE_MOTION: Registry[BesideMotion] = Registry("source of measurements beside motion")
+BESIDE_MOTION: Registry[BesideMotion] = Registry(
+    "source of measurements beside motion"
+)
 
 #: Functions ``run(arguments, bags_of_recordings)`` that join several recordings of a rig into one
 #: result. They return the exit code.
-SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry("way to join recordings")
+SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry(
+    "way to join recordings"
+)
 
 #: Functions ``start(session, installed, reason, log)`` that monitor the mount. ``installed`` is the
 #: installed transform; ``reason`` explains why it is unknown.
@@ -184,11 +188,15 @@ BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 #: Functions ``read(topic, measures)`` that return the reader of the messages of a live topic that
 #: are integrated to poses, by message type. The reader converts the bytes of a message to
 #: ``PoseFields``.
-LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry("kind of live messages")
+LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry(
+    "kind of live messages"
+)
 
 #: Functions that return a module for images of a target: "folder" detects targets in the images of
 #: a folder, and "corners" draws the corners of the target on the images.
-TARGET_IMAGES: Registry[Callable[[], Any]] = Registry("reader of images of a target")
+TARGET_IMAGES: Registry[Callable[[], Any]] = Registry(
+    "reader of images of a target"
+)
 
 #: Functions ``draw(calibration, snapshot, suffix)`` that return further figures of the report: a
 #: list of ``Drawn`` of ``offline/report/style.py``. The names of the figures end in ``suffix``.

@@ -63,7 +63,11 @@ def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
             return spelled_options([(name, value)], interface)
         return f"{_name_alone(name, interface)} {value}"
 
-    return text if interface is Interface.NODE else _OPTION_IN_TEXT.sub(option, text)
+    return (
+        text
+        if interface is Interface.NODE
+        else _OPTION_IN_TEXT.sub(option, text)
+    )
 
 
 def spelled_options(options: Pairs, interface: Interface) -> str:
@@ -144,14 +148,20 @@ def _is_value(name: str, text: str) -> bool:
 def _typed(name: str, value: object) -> str:
     """Return an option and its value, such as ``--max-gap 0.2`` or ``--prior z=1.85+/-0.02``."""
     typed = _name_alone(name, Interface.TERMINAL)
-    return f"{typed}={value}" if name.startswith("prior.") else f"{typed} {value}"
+    return (
+        f"{typed}={value}" if name.startswith("prior.") else f"{typed} {value}"
+    )
 
 
 def _name_alone(name: str, interface: Interface) -> str:
     """Return an option without value, such as ``--max-gap``, ``--prior z`` or ``prior["z"]``."""
     group, _, axis = name.partition(".")
     if interface is Interface.TERMINAL:
-        return f"--prior {axis}" if group == "prior" else f"--{name}".translate(_DASHES)
+        return (
+            f"--prior {axis}"
+            if group == "prior"
+            else f"--{name}".translate(_DASHES)
+        )
     return f'prior["{axis}"]' if group == "prior" else name.replace(".", "_")
 
 

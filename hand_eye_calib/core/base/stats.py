@@ -91,7 +91,9 @@ def share_of_step(n_components: int) -> float:
     return (STUDENT + n_components) / (STUDENT + n_components + 2.0)
 
 
-def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray:
+def student_weights(
+    squared: FloatArray, degrees: float = STUDENT
+) -> FloatArray:
     """Return weights of vectors of six values for Student's t distribution; their mean is 1.
 
     K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
@@ -110,7 +112,9 @@ def student_weights(squared: FloatArray, degrees: float = STUDENT) -> FloatArray
 # Weight functions by kind. Their argument is the squared residual, see :func:`robust_weights`.
 _WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     # P. J. Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35, 1964.
-    "huber": lambda squared: np.asarray(1.0 / np.maximum(np.sqrt(squared), 1.0)),
+    "huber": lambda squared: np.asarray(
+        1.0 / np.maximum(np.sqrt(squared), 1.0)
+    ),
     # P. W. Holland, R. E. Welsch, *Robust regression using iteratively reweighted least-squares*,
     # Comm. Statist. A 6, 1977, table 1.
     "cauchy": lambda squared: 1.0 / (1.0 + squared),
@@ -173,7 +177,9 @@ def robust_regression(
         roots = np.sqrt(weights)[:, None]
         scaled_rows = (roots[..., None] * rows).reshape(-1, rows.shape[2])
         scaled_targets = (roots * targets).ravel()
-        values = np.linalg.lstsq(scaled_rows, scaled_targets, rcond=_RANK_TOLERANCE)[0]
+        values = np.linalg.lstsq(
+            scaled_rows, scaled_targets, rcond=_RANK_TOLERANCE
+        )[0]
         lengths = np.linalg.norm(rows @ values - targets, axis=1)
         divisor = max(unit(lengths), _SMALLEST_UNIT)
         weights = robust_weights(kind, (lengths / divisor) ** 2)

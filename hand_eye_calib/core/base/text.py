@@ -38,7 +38,9 @@ def _suitable_unit(
     size: float, units: Iterable[tuple[float, str, int]]
 ) -> tuple[str, int]:
     """Return the name and factor of the first unit that is suitable for a size."""
-    return next((name, factor) for largest, name, factor in units if not size > largest)
+    return next(
+        (name, factor) for largest, name, factor in units if not size > largest
+    )
 
 
 def angle(radians: float) -> str:
@@ -56,7 +58,11 @@ def amount(axis: str, value: float) -> str:
 def amount_beside(axis: str, value: float, other: float) -> str:
     """Format an amount like :func:`amount`, with more digits if needed to differ from ``other``."""
     text = amount(axis, value)
-    if text != amount(axis, other) or value == other or not math.isfinite(value):
+    if (
+        text != amount(axis, other)
+        or value == other
+        or not math.isfinite(value)
+    ):
         return text
     *_, unit = text.split(" ")
     factors = {name: factor for _, name, factor in _LENGTHS} | {
@@ -72,7 +78,9 @@ def amount_beside(axis: str, value: float, other: float) -> str:
 
 def change(axis: str, value: float, sigma: float) -> str:
     """Format a difference along or about an axis (m, rad) with sign and standard deviation."""
-    unit, factor = ("deg", math.degrees(1.0)) if axis in ABOUT else ("cm", 100.0)
+    unit, factor = (
+        ("deg", math.degrees(1.0)) if axis in ABOUT else ("cm", 100.0)
+    )
     text = with_sigma(factor * value, factor * sigma, 1).replace("+/-", "±")
     if not math.isfinite(sigma):
         return text
@@ -114,7 +122,9 @@ def two_digits(value: float) -> str:
     return text.rstrip("0").rstrip(".") if decimals else text
 
 
-def with_sigma(value: float | None, sigma: float | None, min_decimals: int = 2) -> str:
+def with_sigma(
+    value: float | None, sigma: float | None, min_decimals: int = 2
+) -> str:
     """Format a number with its standard deviation; "unknown" if a number is None or sigma infinite.
 
     The standard deviation has two significant digits. Value and standard deviation have the same
@@ -139,7 +149,9 @@ def fixed(value: float, decimals: int = 4) -> str:
 def in_words(value: object) -> str:
     """Format any plain value as text."""
     if isinstance(value, dict):
-        return ", ".join(f"{name} {in_words(item)}" for name, item in value.items())
+        return ", ".join(
+            f"{name} {in_words(item)}" for name, item in value.items()
+        )
     if isinstance(value, (list, tuple)):
         return "; ".join(in_words(item) for item in value)
     if isinstance(value, float):
@@ -174,8 +186,12 @@ MUCH_NULL = 0.1
 
 def without_poses(n_null: int, n_all: int) -> str:
     """Return a message about null poses that were skipped, with advice if there are many."""
-    counts = f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
-    text = f"{counts}: their quaternion is 0, or a value is not finite or absent"
+    counts = (
+        f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
+    )
+    text = (
+        f"{counts}: their quaternion is 0, or a value is not finite or absent"
+    )
     if n_null > MUCH_NULL * n_all:
         text += ". This is a large share: check whether the source loses track, and record again"
     return text
@@ -197,7 +213,9 @@ def distinct_names(paths: Sequence[str]) -> list[str]:
     first = _n_shared(names)
     rest = [parts[first:] or parts[-1:] for parts in names]
     last = _n_shared([parts[::-1] for parts in rest])
-    return ["/".join(parts[: len(parts) - last] or parts[-1:]) for parts in rest]
+    return [
+        "/".join(parts[: len(parts) - last] or parts[-1:]) for parts in rest
+    ]
 
 
 def _n_shared(paths: Sequence[Sequence[str]]) -> int:
@@ -384,7 +402,9 @@ def quantities(
         If the number of words is wrong, or a word is not an allowed number.
     """
     if len(words) != len(units):
-        raise ConfigError(f"{name} must be {form}; got {shown_value(' '.join(words))}")
+        raise ConfigError(
+            f"{name} must be {form}; got {shown_value(' '.join(words))}"
+        )
     values = []
     for unit, word in zip(units, words, strict=True):
         value = _quantity(name, unit, word)

@@ -14,8 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S, usual_speed
-from hand_eye_calib.core.assessment.moved import SIGNIFICANT, MountChange, find_change
+from hand_eye_calib.core.assessment.common_mode import (
+    FLOOR_TRAVEL_S,
+    usual_speed,
+)
+from hand_eye_calib.core.assessment.moved import (
+    SIGNIFICANT,
+    MountChange,
+    find_change,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import angle, length, listing
@@ -31,9 +38,17 @@ from hand_eye_calib.core.checks.findings import (
     finding,
     graded,
 )
-from hand_eye_calib.core.checks.open_delay import NO_DELAY, OpenDelay, open_delay
+from hand_eye_calib.core.checks.open_delay import (
+    NO_DELAY,
+    OpenDelay,
+    open_delay,
+)
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
 _STREAMS = ("child", "parent")
@@ -195,21 +210,32 @@ def slow_suspects(
         "axes_parent": lambda: axis_gain(slow, "parent"),
     }
     if change:
-        checks["moved"] = lambda: moved_mount(change, int(pose_pairs.stamps_ns[0]))
+        checks["moved"] = lambda: moved_mount(
+            change, int(pose_pairs.stamps_ns[0])
+        )
     groups = [max(checks, key=slow.explained_share)]
     if groups[0].startswith("turned"):
         groups = ["turned_child", "turned_parent", "turned_both"]
-    return [Suspect(slow.explained_share(group), checks[group]()) for group in groups]
+    return [
+        Suspect(slow.explained_share(group), checks[group]())
+        for group in groups
+    ]
 
 
-def check_coordinates(pose_pairs: PosePairs, motions: MotionPairs) -> list[Finding]:
+def check_coordinates(
+    pose_pairs: PosePairs, motions: MotionPairs
+) -> list[Finding]:
     """Return the finding about a coordinate that explains why two streams disagree, or none.
 
     The rotations of both streams must agree.
     """
-    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
+    X = se3.from_rotation_translation(
+        align_rotation_vectors(motions), np.zeros(3)
+    )
     slow, _ = motion_regression(pose_pairs, motions, X)
-    stream = max(_STREAMS, key=lambda name: slow.explained_share(f"axes_{name}"))
+    stream = max(
+        _STREAMS, key=lambda name: slow.explained_share(f"axes_{name}")
+    )
     if slow.explained_share(f"axes_{stream}") <= _EXPLAINING_SHARE:
         return []
     gain = axis_gain(slow, stream)
@@ -220,9 +246,13 @@ def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:
     """Return the finding about an extrinsic, or its translation, of zero, or none."""
     sigma_m = float(extrinsic.sigmas[:3].max())
     sigma_rad = float(extrinsic.sigmas[3:].max())
-    distance_m = float(np.linalg.norm(se3.translation_of(extrinsic.T_parent_child)))
+    distance_m = float(
+        np.linalg.norm(se3.translation_of(extrinsic.T_parent_child))
+    )
     upper_m = distance_m + 2 * sigma_m
-    angle_rad = float(se3.rotation_angle(se3.rotation_of(extrinsic.T_parent_child)))
+    angle_rad = float(
+        se3.rotation_angle(se3.rotation_of(extrinsic.T_parent_child))
+    )
     is_parallel = angle_rad < max(SAME_RAD, ZERO_SIGMAS * sigma_rad)
     may_be_zero = distance_m < ZERO_SIGMAS * sigma_m
     near_m = _PARALLEL_M if is_parallel or may_be_zero else _NEARLY_M
@@ -267,13 +297,17 @@ def _turned_world(slow: Regression, stream: str) -> Finding | None:
     rotation_vector, sigmas = slow.fit(f"turned_{stream}")
     angles_rad = np.abs(rotation_vector)
     limits = LIMITS["worlds_turned"]
-    noise = np.hypot(limits.sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}"))
+    noise = np.hypot(
+        limits.sigmas * sigmas, BIASES * slow.biases(f"turned_{stream}")
+    )
     if (angles_rad < noise).all() or angles_rad.max() < limits.note:
         return None
     turned_rad = float(np.linalg.norm(angles_rad))
     axis = "xyz"[int(np.argmax(angles_rad))]
     turned_deg = float(np.degrees(turned_rad))
-    return graded("worlds_turned", stream, turned_rad, axis=axis, turned_deg=turned_deg)
+    return graded(
+        "worlds_turned", stream, turned_rad, axis=axis, turned_deg=turned_deg
+    )
 
 
 class _Deviation(NamedTuple):
@@ -316,7 +350,11 @@ def axis_gain(slow: Regression, stream: str) -> Finding | None:
     size = gain.size
     if slow.explained_share(group) <= _ERROR_SHARE:
         size = min(abs(size), LIMITS["axis_scale"].error)
-    values = {"axis": "xyz"[gain.axis], "factor": 1.0 + gain.size, "sigma": gain.sigma}
+    values = {
+        "axis": "xyz"[gain.axis],
+        "factor": 1.0 + gain.size,
+        "sigma": gain.sigma,
+    }
     return graded("axis_scale", stream, size, gain.sigma, **values)
 
 
@@ -407,7 +445,9 @@ class _Delay:
         if is_expected:
             sigma_m *= _EXPECTED_SIGMA_SHARE
         error_m = LIMITS["late"].error
-        is_minor = self.size_s < _ERROR_DELAY_S or self.explained_share < _ERROR_SHARE
+        is_minor = (
+            self.size_s < _ERROR_DELAY_S or self.explained_share < _ERROR_SHARE
+        )
         if self._is_always_error(shift_m):
             size_m = max(shift_m, _JUST_ABOVE * error_m)
         elif is_expected or is_minor:
@@ -427,7 +467,9 @@ class _Delay:
 
     def _is_always_error(self, shift_m: float) -> bool:
         """Return whether the delay is an error even if it is expected or explains little."""
-        if self.size_s <= max(_ALWAYS_ERROR_S, _ALWAYS_ERROR_SIGMAS * self.sigma_s):
+        if self.size_s <= max(
+            _ALWAYS_ERROR_S, _ALWAYS_ERROR_SIGMAS * self.sigma_s
+        ):
             return False
         if shift_m > LIMITS["late"].error:
             return True
@@ -477,12 +519,16 @@ def delay_suspects(
             punctual="others",
             size_s=deviation.size,
             sigma_s=deviation.sigma,
-            speed_m_s=usual_speed(pairs.stamps_ns, poses[:, [deviation.axis], 3]),
+            speed_m_s=usual_speed(
+                pairs.stamps_ns, poses[:, [deviation.axis], 3]
+            ),
             explained_share=fast.explained_share(axis_group, *smoothing),
         )
         for delay in (late, late_axis):
             if delay.size_s > _MIN_DELAY_S:
-                yield Suspect(delay.explained_share, delay.finding(stream, offset_s))
+                yield Suspect(
+                    delay.explained_share, delay.finding(stream, offset_s)
+                )
 
 
 def smoothing_suspects(
@@ -511,11 +557,15 @@ def smoothing_suspects(
             coefficients, sigmas = fast.fit(group, delay)
             smoothing_s2 = float(coefficients[0])
             noise_s2 = limits.sigmas * float(sigmas[0])
-            if smoothing_s2 < max(min_smoothing_s2 + interpolation_s2, noise_s2):
+            if smoothing_s2 < max(
+                min_smoothing_s2 + interpolation_s2, noise_s2
+            ):
                 continue
             smoothing_s = smoothing_s2**0.5
             displaced_m = smoothing_s2 * float(fast.displacements_m(group)[0])
-            shift_m = max(displaced_m, min(smoothing_s * speed_m_s, limits.error))
+            shift_m = max(
+                displaced_m, min(smoothing_s * speed_m_s, limits.error)
+            )
             smoothed = graded(
                 "smoothed",
                 stream,

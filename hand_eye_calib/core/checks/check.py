@@ -22,10 +22,16 @@ from typing import NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.alignment import similarity, time_offset
-from hand_eye_calib.core.alignment.rate_correlation import MIN_VARIATION, Correlation
+from hand_eye_calib.core.alignment.rate_correlation import (
+    MIN_VARIATION,
+    Correlation,
+)
 from hand_eye_calib.core.alignment.similarity import SimilarityFit
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
-from hand_eye_calib.core.assessment.covariance import hidden_axes, lever_arm_products
+from hand_eye_calib.core.assessment.covariance import (
+    hidden_axes,
+    lever_arm_products,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -52,7 +58,12 @@ from hand_eye_calib.core.checks.findings import (
     gravest_first,
     unobservable_axes,
 )
-from hand_eye_calib.core.checks.hypothesis import HOLDS, PLAIN, Explanation, Readings
+from hand_eye_calib.core.checks.hypothesis import (
+    HOLDS,
+    PLAIN,
+    Explanation,
+    Readings,
+)
 from hand_eye_calib.core.checks.open_delay import NO_DELAY
 from hand_eye_calib.core.checks.stream_pair import (
     LAGS_S,
@@ -69,7 +80,11 @@ from hand_eye_calib.core.checks.streams import (
 )
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 
 # Accuracy of the coarse clock offset of slow streams, in intervals between poses.
 _COARSE_INTERVALS = 0.5
@@ -154,12 +169,16 @@ def check_streams(
     explanation = None
     offset = TimeOffset()
     if earlier and not streams.is_slow:
-        explanation, offset = _explain_by_extrinsic(streams, earlier.T_parent_child)
+        explanation, offset = _explain_by_extrinsic(
+            streams, earlier.T_parent_child
+        )
     if not explanation:
         correlation = (correlate or original.correlate)()
         if factor := _factor_of_angles(correlation):
             return CheckResult(gravest_first([*findings, factor]))
-        streams, offset = _coarse_offset(original, streams, time_offset_s, correlation)
+        streams, offset = _coarse_offset(
+            original, streams, time_offset_s, correlation
+        )
     aligned = streams.shifted(offset.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
@@ -206,7 +225,10 @@ def _factor_of_angles(correlation: Correlation) -> Finding | None:
 
 
 def _coarse_offset(
-    original: StreamPair, streams: StreamPair, added_s: float, correlation: Correlation
+    original: StreamPair,
+    streams: StreamPair,
+    added_s: float,
+    correlation: Correlation,
 ) -> tuple[StreamPair, TimeOffset]:
     """Return the streams to compare, and the remaining clock offset by their angular rates.
 
@@ -220,9 +242,13 @@ def _coarse_offset(
         Correlation of the angular rates of the original streams.
     """
     if streams.is_slow:
-        streams, remaining = _align_slow(original, streams, added_s, correlation)
+        streams, remaining = _align_slow(
+            original, streams, added_s, correlation
+        )
     else:
-        remaining = replace(correlation, offset_s=correlation.offset_s - added_s)
+        remaining = replace(
+            correlation, offset_s=correlation.offset_s - added_s
+        )
     if not correlation.is_clear:
         # A short recording may not reveal the offset. The streams may still agree with added_s.
         remaining = replace(remaining, offset_s=0.0)
@@ -252,7 +278,9 @@ def _check_explained(
     corrected = explanation.hypothesis.undo(streams)
     offset = _fine_offset(corrected, coarse_offset, explanation.fit)
     corrected = corrected.shifted(offset.seconds)
-    sizes, fit = _check_sizes(corrected, explanation, offset.fit, arguments.scale)
+    sizes, fit = _check_sizes(
+        corrected, explanation, offset.fit, arguments.scale
+    )
     lengths = _lengths_of_explained(streams, corrected, fit, explanation)
     # Findings of an unclear reading: either both streams hold inverse poses, or none does.
     of_reading = explanation.findings if explanation.may_be_uninverted else ()
@@ -265,7 +293,11 @@ def _check_explained(
     is_sound = not _are_unusable(
         [found for found in findings if found not in of_reading]
     )
-    findings += [*lengths, *check_offset(offset, arguments.time_offset_s), *sizes]
+    findings += [
+        *lengths,
+        *check_offset(offset, arguments.time_offset_s),
+        *sizes,
+    ]
     delay = NO_DELAY
     if is_sound and not lengths:
         earlier = arguments.earlier
@@ -316,13 +348,16 @@ def _preferred_reading(
     fitted. Otherwise ``corrected`` and ``fit`` are returned.
     """
     has_other_reading = (
-        explanation.may_be_uninverted and not explanation.hypothesis.is_uninverted
+        explanation.may_be_uninverted
+        and not explanation.hypothesis.is_uninverted
     )
     if not earlier or not has_other_reading:
         return corrected, fit
     uninverted = streams.shifted(offset.seconds)
     motions = _motions(uninverted.synchronised, MAX_PAIRS)
-    return uninverted, similarity.fit_similarity(motions, start=earlier.T_parent_child)
+    return uninverted, similarity.fit_similarity(
+        motions, start=earlier.T_parent_child
+    )
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
@@ -334,8 +369,12 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
     sigmas : (3,) array
         Standard deviations of its translation, m.
     """
-    sizes = np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
-    return float(np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None)))
+    sizes = (
+        np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
+    )
+    return float(
+        np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None))
+    )
 
 
 def _explain_by_extrinsic(
@@ -361,12 +400,18 @@ def _explain_by_extrinsic(
         HOLDS,
     )
     fit = offset.fit
-    if fit is None or not fit.is_in_one_unit or fit.unexplained >= similarity.EXPLAINED:
+    if (
+        fit is None
+        or not fit.is_in_one_unit
+        or fit.unexplained >= similarity.EXPLAINED
+    ):
         return None, TimeOffset()
     if offset.largest_s(streams.child.duration_s) >= error_s:
         return None, TimeOffset()
     shifted = streams.shifted(offset.seconds)
-    explanation = hypotheses.choose_reading(Explanation(PLAIN, fit), shifted, lag_s)
+    explanation = hypotheses.choose_reading(
+        Explanation(PLAIN, fit), shifted, lag_s
+    )
     if explanation.findings:
         return None, TimeOffset()
     return explanation, offset
@@ -389,7 +434,9 @@ def _fine_offset(
         return coarse_offset
     if corrected.is_slow:
         return TimeOffset(
-            coarse_offset.seconds, corrected.interval_s, coarse_offset.correlation
+            coarse_offset.seconds,
+            corrected.interval_s,
+            coarse_offset.correlation,
         )
     return time_offset.refine_time_offset(
         corrected.parent,
@@ -401,7 +448,10 @@ def _fine_offset(
 
 
 def _align_slow(
-    original: StreamPair, shifted: StreamPair, added_s: float, correlation: Correlation
+    original: StreamPair,
+    shifted: StreamPair,
+    added_s: float,
+    correlation: Correlation,
 ) -> tuple[StreamPair, Correlation]:
     """Return slow streams on one clock, and the correlation with the remaining clock offset.
 
@@ -493,7 +543,9 @@ def _check_sizes(
     motions = _motions(pose_pairs, MAX_PAIRS)
     fit = explanation.fit
     chords = se3.rotation_of(motions.Ts_parenti_parentj) - np.eye(3)
-    hidden = hidden_axes(lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3))
+    hidden = hidden_axes(
+        lever_arm_products(chords), fit.sigma_rotation**2 * np.eye(3)
+    )
     findings = [unobservable_axes(hidden)] if hidden else []
     if explanation.same_unit or fit.is_in_one_unit:
         return findings, fit
@@ -505,7 +557,9 @@ def _check_sizes(
     ]
     with suppress(NotEnoughDataError):
         fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
-        other_unit = own_unit(streams, fit, used_scale) if fit.has_own_unit else None
+        other_unit = (
+            own_unit(streams, fit, used_scale) if fit.has_own_unit else None
+        )
         if other_unit:
             findings.append(other_unit)
     return findings, fit
@@ -550,7 +604,10 @@ def _check_agreeing(
 
 
 def check_parts(
-    parent: Trajectory, child: Trajectory, max_gap_s: float, lever_arm_m: float = 0.0
+    parent: Trajectory,
+    child: Trajectory,
+    max_gap_s: float,
+    lever_arm_m: float = 0.0,
 ) -> list[Finding]:
     """Check two streams on one clock, if at least one stream has no full poses.
 
@@ -579,7 +636,10 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
         return False
     for stream in (parent, child):
         rotations = se3.rotation_of(stream.poses)
-        if se3.rotation_angle(rotations[0].T @ rotations).max() >= MIN_ROTATION_RAD:
+        if (
+            se3.rotation_angle(rotations[0].T @ rotations).max()
+            >= MIN_ROTATION_RAD
+        ):
             return True
     return False
 

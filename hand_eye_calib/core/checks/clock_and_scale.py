@@ -23,15 +23,21 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
 
     ``added_s`` was added to the child's stamps before, s.
     """
-    values = offset_values(offset.seconds, added_s) | {"sigma_s": offset.sigma_s}
-    values["beyond"] = f" beyond the {added_s:.4f} s that were added" if added_s else ""
+    values = offset_values(offset.seconds, added_s) | {
+        "sigma_s": offset.sigma_s
+    }
+    values["beyond"] = (
+        f" beyond the {added_s:.4f} s that were added" if added_s else ""
+    )
     values["options"] = {"time_offset": values["total_s"]}
     clocks_differ = graded(
         "time_offset", "child", offset.seconds, offset.sigma_s, **values
     )
     if not clocks_differ:
         return []
-    if added_s and abs(values["total_s"]) <= max(3.0 * offset.sigma_s, _NO_OFFSET_S):
+    if added_s and abs(values["total_s"]) <= max(
+        3.0 * offset.sigma_s, _NO_OFFSET_S
+    ):
         values["options"] = {"time_offset": 0.0}
         severity = clocks_differ.severity
         return [finding("needless_time_offset", "child", severity, **values)]

@@ -95,7 +95,9 @@ class Regression:
     ) -> None:
         self._columns = columns
         self._base = base
-        self._displacements_m = np.sqrt((rows[:, :3] ** 2).sum(axis=1).mean(axis=0))
+        self._displacements_m = np.sqrt(
+            (rows[:, :3] ** 2).sum(axis=1).mean(axis=0)
+        )
         rows = rows / units
         n_motions, size, n_columns = rows.shape
         flat = rows.reshape(-1, n_columns)
@@ -105,9 +107,13 @@ class Regression:
             products = (of_base * np.repeat(weights, size)[:, None]).T @ of_base
             coefficients = solve(products, range(len(products) - 1))
             residuals = of_base[:, -1] - of_base[:, :-1] @ coefficients
-            lengths = np.sqrt((residuals.reshape(n_motions, size) ** 2).sum(axis=1))
+            lengths = np.sqrt(
+                (residuals.reshape(n_motions, size) ** 2).sum(axis=1)
+            )
             self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
-            squared = (lengths / self._sigma) ** 2 / (size * _QUARTER_WEIGHT_SIGMAS**2)
+            squared = (lengths / self._sigma) ** 2 / (
+                size * _QUARTER_WEIGHT_SIGMAS**2
+            )
             weights = robust_weights("geman_mcclure", squared)
         self._total_weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
@@ -119,7 +125,9 @@ class Regression:
         """Return the columns of groups, in the order of the groups."""
         return [column for name in groups for column in self._columns[name]]
 
-    def _columns_beside(self, group: str, nuisances: tuple[str, ...]) -> list[int]:
+    def _columns_beside(
+        self, group: str, nuisances: tuple[str, ...]
+    ) -> list[int]:
         """Return the columns that are fitted together with a group: its base and nuisances."""
         base = [name for name in self._base if name != _REPLACED.get(group)]
         return self._columns_of([*base, *nuisances])
@@ -145,7 +153,9 @@ class Regression:
         of_extrinsic = self._columns_of(["lever", "rotation"])
         information = self._products[np.ix_(of_extrinsic, of_extrinsic)]
         coupling = self._products[np.ix_(of_extrinsic, self._columns[group])]
-        return np.asarray(np.linalg.pinv(information, hermitian=True) @ coupling)
+        return np.asarray(
+            np.linalg.pinv(information, hermitian=True) @ coupling
+        )
 
     def explained_share(self, group: str, *nuisances: str) -> float:
         """Return the share (0 to 1) of the squared residuals that a group explains.
@@ -210,16 +220,20 @@ class _Stream:
         self._R_parent_sensor = R_parent_sensor
         self.rows = pairs.i, (pairs.i + pairs.j) // 2, pairs.j
         start, middle, end = (poses[rows] for rows in self.rows)
-        self.from_world = R_parent_sensor @ np.swapaxes(se3.rotation_of(middle), 1, 2)
+        self.from_world = R_parent_sensor @ np.swapaxes(
+            se3.rotation_of(middle), 1, 2
+        )
         self.R_start = self.from_world @ se3.rotation_of(start)
         self.R_end = self.from_world @ se3.rotation_of(end)
         self.chords = self.R_end - self.R_start
         to_start = R_parent_sensor @ np.swapaxes(se3.rotation_of(start), 1, 2)
         self.rotations = to_start @ se3.rotation_of(end) @ R_parent_sensor.T
-        self.displacements_in_world = se3.translation_of(end) - se3.translation_of(
-            start
+        self.displacements_in_world = se3.translation_of(
+            end
+        ) - se3.translation_of(start)
+        self.displacements = se3.times(
+            self.from_world, self.displacements_in_world
         )
-        self.displacements = se3.times(self.from_world, self.displacements_in_world)
 
     def start_minus_end(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (N, 3) at the start minus those at the end, in the axes at the start.
@@ -269,7 +283,9 @@ def motion_regression(
     - ``moved``: change of lever arm and rotation of X after ``moved_at_ns``, if given.
     """
     parent = _Stream(pose_pairs.Ts_pw_p, motions, np.eye(3))
-    child = _Stream(pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child))
+    child = _Stream(
+        pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child)
+    )
     # Displacements of each stream in its own world, predicted from the other stream.
     arm = se3.times(parent.chords, se3.translation_of(T_parent_child))
     parent_to_world = np.swapaxes(parent.from_world, 1, 2)
@@ -279,28 +295,39 @@ def motion_regression(
     stamps_ns = pose_pairs.stamps_ns
     durations_s = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
     drifted = child.from_world * durations_s[:, None, None]
-    middle = pose_pairs.Ts_cw_c[motions.i, :3, 3] + 0.5 * child.displacements_in_world
+    middle = (
+        pose_pairs.Ts_cw_c[motions.i, :3, 3]
+        + 0.5 * child.displacements_in_world
+    )
     middle = middle - middle.mean(axis=0)
     rotations = se3.rotation_log(parent.rotations)
     axes = np.linalg.eigh(rotations.T @ rotations)[1][:, ::-1]
     turned_child = -child.from_world @ se3.skew(child.displacements_in_world)
     turned_parent = parent.from_world @ se3.skew(parent.displacements_in_world)
-    R_cw_pw = se3.nearest_rotation((child_to_world @ parent.from_world).mean(axis=0))
+    R_cw_pw = se3.nearest_rotation(
+        (child_to_world @ parent.from_world).mean(axis=0)
+    )
     translating = _regressors(drifted)
     rotating = _regressors(-drifted @ se3.skew(middle), drifted)
     groups = {
         "turned_child": _regressors(turned_child),
         "turned_parent": _regressors(turned_parent),
         "turned_both": _regressors(turned_parent + turned_child @ R_cw_pw),
-        "axes_child": _regressors(child.from_world * child_predicted[:, None, :]),
-        "axes_parent": _regressors(-parent.from_world * parent_predicted[:, None, :]),
+        "axes_child": _regressors(
+            child.from_world * child_predicted[:, None, :]
+        ),
+        "axes_parent": _regressors(
+            -parent.from_world * parent_predicted[:, None, :]
+        ),
         "drift": np.concatenate([translating, rotating], axis=2),
         "gain": _regressors(
             np.zeros_like(drifted), (rotations @ axes)[:, None, :] * axes[None]
         ),
     }
     if moved_at_ns is not None:
-        is_after = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2 >= moved_at_ns
+        is_after = (
+            stamps_ns[motions.i] + stamps_ns[motions.j]
+        ) // 2 >= moved_at_ns
         base = _base_groups(parent, child)
         of_extrinsic = np.concatenate([base["lever"], base["rotation"]], axis=2)
         groups["moved"] = is_after[:, None, None] * of_extrinsic
@@ -355,7 +382,9 @@ def delay_regression(
     from_other = _filter_groups(
         parent_of_child, child_of_parent, lever_arm, around, step_s
     )
-    instruments = {name: from_other[name] for name in ("late_child", "late_parent")}
+    instruments = {
+        name: from_other[name] for name in ("late_child", "late_parent")
+    }
     return _regression(parent, child, X, groups, instruments, "late")
 
 
@@ -385,7 +414,9 @@ def _filter_groups(
         )
         if name == "child":
             displaced = late + se3.cross(rate[middle], stream.displacements)
-            groups["late"] = _regressors(displaced, stream.start_minus_end(rate))
+            groups["late"] = _regressors(
+                displaced, stream.start_minus_end(rate)
+            )
         else:
             # The parent's orientations at both ends rotate the lever arm.
             at_start = se3.cross(angular_acceleration[start], lever_arm)
@@ -449,7 +480,9 @@ def _regression(
     other groups. ``also_in_base`` names groups that join the base.
     """
     displaced = child.displacements - parent.displacements
-    turned = se3.rotation_log(child.rotations @ np.swapaxes(parent.rotations, 1, 2))
+    turned = se3.rotation_log(
+        child.rotations @ np.swapaxes(parent.rotations, 1, 2)
+    )
     residuals_m = displaced - se3.times(parent.chords, se3.translation_of(X))
     units = noise_units(residuals_m, turned)[:, None]
     base = _base_groups(parent, child)
@@ -463,6 +496,10 @@ def _regression(
         [*all_groups.values(), _regressors(displaced, turned)], axis=2
     )
     instrument_rows = rows.copy()
-    for name, regressors in (_base_groups(child, child) | dict(instruments)).items():
+    for name, regressors in (
+        _base_groups(child, child) | dict(instruments)
+    ).items():
         instrument_rows[:, :, columns[name]] = regressors
-    return Regression(rows, instrument_rows, units, columns, [*base, *also_in_base])
+    return Regression(
+        rows, instrument_rows, units, columns, [*base, *also_in_base]
+    )

@@ -7,7 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.config import METHODS, CalibratorConfig, defaults_of
+from hand_eye_calib.core.base.config import (
+    METHODS,
+    CalibratorConfig,
+    defaults_of,
+)
 from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.base.spelling import PLACEHOLDER
 from hand_eye_calib.core.base.text import axes_in_words
@@ -90,7 +94,9 @@ LIMITS = {
     # Factor, less 1.
     "axis_scale": Limits(6.0, 0.015, 0.015, 0.05),
     # Radians.
-    "worlds_turned": Limits(6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)),
+    "worlds_turned": Limits(
+        6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)
+    ),
     # Share of the speed: the error of the direction is half the usual target of a rotation.
     "world_drift": Limits(6.0, 0.003, 0.003, _NEVER),
     # Metres, of a place up to 1 m from the sensor.
@@ -116,7 +122,9 @@ def graded(
     """
     limits = LIMITS[key]
     size = abs(size)
-    if not size >= max(limits.note, limits.sigmas * sigma):  # NaN is below all limits
+    if not size >= max(
+        limits.note, limits.sigmas * sigma
+    ):  # NaN is below all limits
         return None
     if size > limits.error:
         severity = Severity.ERROR
@@ -206,14 +214,18 @@ def repair_message(
     faults = "; ".join([issue.what for issue in findings])
     used = options_in_words(options)
     undo = options_in_words(defaults_of(options))
-    return f"repaired: {faults}. Solved with {used}{verdicts} (undo with {undo})"
+    return (
+        f"repaired: {faults}. Solved with {used}{verdicts} (undo with {undo})"
+    )
 
 
 def unobservable_axes(axes: Sequence[str]) -> Finding:
     """Return the note that the motion does not determine some axes of X."""
     options = {f"prior.{axis}": PLACEHOLDER for axis in axes}
     pronoun = "it" if len(axes) == 1 else "them"
-    return finding("one_axis", options=options, axes=axes_in_words(axes), it=pronoun)
+    return finding(
+        "one_axis", options=options, axes=axes_in_words(axes), it=pronoun
+    )
 
 
 def _beside_priors(note: Finding, current: Options) -> Finding:
@@ -228,7 +240,9 @@ def _beside_priors(note: Finding, current: Options) -> Finding:
     return finding("one_axis_with_prior", axes=axes_in_words(axes))
 
 
-def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Finding]:
+def answered(
+    findings: Sequence[Finding], config: CalibratorConfig
+) -> list[Finding]:
     """Return findings with the severity that they have under a configuration.
 
     A finding becomes a note if the configuration has all options that repair the fault. A small
@@ -243,7 +257,9 @@ def answered(findings: Sequence[Finding], config: CalibratorConfig) -> list[Find
             # If a corrected stream needs the same correction again, it was right at first: the
             # finding then proposes the default values of these options.
             repeated = [
-                name for name, value in options.items() if current[name] == value
+                name
+                for name, value in options.items()
+                if current[name] == value
             ]
             options |= defaults_of(repeated)
         is_answered = options and all(

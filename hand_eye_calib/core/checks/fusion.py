@@ -29,7 +29,11 @@ from hand_eye_calib.core.checks.fault_regression import ROUNDS, noise_units
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.checks.stream_pair import MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 
 # Time constants T of the filters that are tried, s. A filter between two of them is detected by
 # both.
@@ -88,13 +92,17 @@ class _Fit(NamedTuple):
     @property
     def is_turned(self) -> bool:
         """Whether the rotation of D is significant."""
-        is_large = self.rotation_rad > _LEAST_ROTATION_RAD and self.share > _SHARE
+        is_large = (
+            self.rotation_rad > _LEAST_ROTATION_RAD and self.share > _SHARE
+        )
         return is_large and self.rotation_sigmas > _SIGMAS
 
     @property
     def is_shifted(self) -> bool:
         """Whether the translation of D is significant."""
-        is_large = self.translation_m > _LEAST_TRANSLATION_M and self.share > _SHARE
+        is_large = (
+            self.translation_m > _LEAST_TRANSLATION_M and self.share > _SHARE
+        )
         return is_large and self.translation_sigmas > _SIGMAS
 
     @property
@@ -220,14 +228,24 @@ class _Regressors:
         inner = 0.5 * (rates[1:] + rates[:-1])
         of_clock = np.concatenate([rates[:1], inner, rates[-1:]])
         parents = self._poses @ se3.inverse(self._T_parent_child)
-        of_parent = np.gradient(se3.translation_of(parents), self._seconds, axis=0)
-        of_child = np.gradient(se3.translation_of(self._poses), self._seconds, axis=0)
+        of_parent = np.gradient(
+            se3.translation_of(parents), self._seconds, axis=0
+        )
+        of_child = np.gradient(
+            se3.translation_of(self._poses), self._seconds, axis=0
+        )
         to_child = np.swapaxes(se3.rotation_of(self._poses), 1, 2)
         errors = [of_clock]
-        for displacements in (se3.translation_of(self._poses), of_child, of_parent):
+        for displacements in (
+            se3.translation_of(self._poses),
+            of_child,
+            of_parent,
+        ):
             translations = se3.times(to_child, displacements)
             errors.append(
-                np.concatenate([translations, np.zeros_like(translations)], axis=1)
+                np.concatenate(
+                    [translations, np.zeros_like(translations)], axis=1
+                )
             )
         of_motions = self._between(np.stack(errors, axis=2))
         return np.concatenate([mount, of_motions], axis=2)
@@ -276,15 +294,23 @@ class _Differences:
     T_parent_child : (4, 4) array
     """
 
-    def __init__(self, pose_pairs: PosePairs, T_parent_child: FloatArray) -> None:
+    def __init__(
+        self, pose_pairs: PosePairs, T_parent_child: FloatArray
+    ) -> None:
         poses = pose_pairs.Ts_pw_p @ T_parent_child
         seconds = (pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9
-        pairs = pairs_over(replace(pose_pairs, Ts_pw_p=poses), SHORT_S, _MOST_MOTIONS)
+        pairs = pairs_over(
+            replace(pose_pairs, Ts_pw_p=poses), SHORT_S, _MOST_MOTIONS
+        )
         motions_back = se3.inverse(pairs.Ts_parenti_parentj)
         self._residuals = se3.log(motions_back @ pairs.Ts_childi_childj)
-        self._units = noise_units(self._residuals[:, :3], self._residuals[:, 3:])
+        self._units = noise_units(
+            self._residuals[:, :3], self._residuals[:, 3:]
+        )
         self._of_parent = _Regressors(poses, T_parent_child, seconds, pairs)
-        self._of_child = _Regressors(pose_pairs.Ts_cw_c, T_parent_child, seconds, pairs)
+        self._of_child = _Regressors(
+            pose_pairs.Ts_cw_c, T_parent_child, seconds, pairs
+        )
         self._usual_errors = self._of_parent.usual_errors()
         self._usual_instruments = self._of_child.usual_errors()
 
@@ -332,7 +358,9 @@ class _Differences:
             regression.share,
         )
 
-    def _joined(self, usual_errors: FloatArray, filtered: FloatArray) -> FloatArray:
+    def _joined(
+        self, usual_errors: FloatArray, filtered: FloatArray
+    ) -> FloatArray:
         """Return rows (K, 6, p + 1) of regressors and differences, in units of the noise."""
         residuals = self._residuals[:, :, None]
         joined = np.concatenate([usual_errors, filtered, residuals], axis=2)
@@ -346,7 +374,9 @@ class _Differences:
         """
         weights = np.ones(len(rows))
         for _ in range(ROUNDS):
-            coefficients = solve(_table(rows, weights), range(rows.shape[2] - 1))
+            coefficients = solve(
+                _table(rows, weights), range(rows.shape[2] - 1)
+            )
             errors = rows @ np.append(-coefficients, 1.0)
             squared = (errors**2).sum(axis=1)
             weights = robust_weights(
@@ -358,7 +388,9 @@ class _Differences:
 def _table(rows: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the products (p + 1, p + 1) of rows (K, 6, p + 1), summed with weights (K,)."""
     flat = rows.reshape(-1, rows.shape[2])
-    return np.asarray(flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None]))
+    return np.asarray(
+        flat.T @ (flat * np.repeat(weights, rows.shape[1])[:, None])
+    )
 
 
 def _cost(table: FloatArray, columns: range) -> float:

@@ -106,7 +106,9 @@ def explain(
             continue
         chosen = _or_usual_mistake(plain, streams, lag_s, thorough)
         if not chosen.holds and thorough and not failed:
-            chosen = _or_rival(chosen, hypotheses_of_axes(), streams, lag_s, HOLDS)
+            chosen = _or_rival(
+                chosen, hypotheses_of_axes(), streams, lag_s, HOLDS
+            )
         if chosen.holds:
             return _with_findings(chosen, streams, lag_s)
         failed.append(chosen)
@@ -117,7 +119,9 @@ def explain(
     return _unexplained(best, streams, thorough)
 
 
-def _plain(streams: StreamPair, lag_s: float, start: FloatArray | None) -> Explanation:
+def _plain(
+    streams: StreamPair, lag_s: float, start: FloatArray | None
+) -> Explanation:
     """Fit the streams without corrections, and once more without the start if it fails."""
     plain = _fitted(PLAIN, streams, lag_s, start)
     if start is not None and not plain.holds:
@@ -131,7 +135,9 @@ def _or_usual_mistake(
     """Return the explanation by a usual mistake, or ``plain`` if no mistake is far better."""
     if plain.holds:
         # Streams of an arm, or on nearly flat ground, may agree in spite of one mistake.
-        rivals = [hypothesis for hypothesis in USUAL if len(hypothesis.mistakes) == 1]
+        rivals = [
+            hypothesis for hypothesis in USUAL if len(hypothesis.mistakes) == 1
+        ]
     else:
         rivals = USUAL
         # If a body rotates about one of its sensors, the translations of that sensor are noise.
@@ -157,7 +163,9 @@ def _with_findings(
     return replace(explanation, findings=(*explanation.findings, *doubts))
 
 
-def _unexplained(best: Explanation, streams: StreamPair, thorough: bool) -> Explanation:
+def _unexplained(
+    best: Explanation, streams: StreamPair, thorough: bool
+) -> Explanation:
     """Add the finding "unexplained" to the best of the explanations that do not hold.
 
     If the search was thorough and the unexplained share is small, noise may be its cause. The
@@ -205,12 +213,18 @@ def _below(
     for rival in rivals:
         parent = rival.corrected("parent", few.Ts_pw_p)
         child = rival.corrected("child", few.Ts_cw_c)
-        motions = motion_pairs.pairs_between(parent, child, first, first + len(pairs))
+        motions = motion_pairs.pairs_between(
+            parent, child, first, first + len(pairs)
+        )
         # To save time, a fit stops if its start leaves far more than ``most`` unexplained.
         fit = fit_similarity(motions, max_unexplained=_DECISIVE * most)
         tried.append(Explanation(rival, fit))
         most = min(most, _ABOUT_EQUAL * fit.unexplained)
-    return [explanation for explanation in tried if explanation.fit.unexplained <= most]
+    return [
+        explanation
+        for explanation in tried
+        if explanation.fit.unexplained <= most
+    ]
 
 
 def _fitted(
@@ -235,11 +249,16 @@ def _or_axes(
     the finding "ambiguous" is returned with the chosen explanation.
     """
     unexplained = chosen.fit.unexplained
-    rivals = _below(_ABOUT_EQUAL * unexplained, hypotheses_of_axes(), streams, lag_s)
+    rivals = _below(
+        _ABOUT_EQUAL * unexplained, hypotheses_of_axes(), streams, lag_s
+    )
     if not rivals:
         return chosen, []
     simplest = _simplest(rivals).hypothesis
-    if _ABOUT_EQUAL**0.5 * min(rival.fit.unexplained for rival in rivals) < unexplained:
+    if (
+        _ABOUT_EQUAL**0.5 * min(rival.fit.unexplained for rival in rivals)
+        < unexplained
+    ):
         return _fitted(simplest, streams, lag_s), []
     _, stream = simplest.mistakes[0]
     return chosen, [finding("ambiguous", stream, detail=simplest.detail)]
@@ -265,7 +284,9 @@ def _steadier(
     ):
         return chosen, True
     # Scatter of the direction under each hypothesis: that of the less steady of both sensors.
-    scatters = np.maximum.outer(_scatters(streams.parent), _scatters(streams.child))
+    scatters = np.maximum.outer(
+        _scatters(streams.parent), _scatters(streams.child)
+    )
     scatter = dict(zip(CONVENTIONAL, scatters.flat, strict=True))
     scatter_of_chosen = scatter[hypothesis]
     smallest = min(scatter.values())
@@ -315,14 +336,18 @@ def choose_reading(
             is_small=False,
         )
         return replace(
-            explanation, findings=findings_of(hypothesis), readings=readings.ordered()
+            explanation,
+            findings=findings_of(hypothesis),
+            readings=readings.ordered(),
         )
     readings = _readings(explanation, streams)
     if hypothesis.is_uninverted and readings.shape < 0.0:
         findings = findings_of(hypothesis)
         is_doubtful = readings.shape > _SUSPICIOUS
         return replace(
-            explanation, findings=findings, readings=readings if is_doubtful else None
+            explanation,
+            findings=findings,
+            readings=readings if is_doubtful else None,
         )
     return _in_likelier_reading(explanation, readings, streams, lag_s)
 
@@ -348,7 +373,10 @@ def _readings(explanation: Explanation, streams: StreamPair) -> Readings:
 
 
 def _in_likelier_reading(
-    explanation: Explanation, readings: Readings, streams: StreamPair, lag_s: float
+    explanation: Explanation,
+    readings: Readings,
+    streams: StreamPair,
+    lag_s: float,
 ) -> Explanation:
     """Return the explanation by the likelier hypothesis of two readings, with its findings."""
     hypothesis = explanation.hypothesis
@@ -363,7 +391,9 @@ def _in_likelier_reading(
     )
     if likelier.is_uninverted:
         options = conventions("inverse", "both")
-        findings += (finding("inverse_both", "both", Severity.WARNING, options),)
+        findings += (
+            finding("inverse_both", "both", Severity.WARNING, options),
+        )
     return replace(explanation, findings=findings, readings=readings.ordered())
 
 
@@ -377,6 +407,12 @@ def findings_of(
     findings = []
     for code, stream in hypothesis.mistakes:
         key = "inverse_both" if (code, stream) == ("inverse", "both") else code
-        options = conventions(code, stream) if has_options or code != "inverse" else {}
-        findings.append(finding(key, stream, options=options, detail=hypothesis.detail))
+        options = (
+            conventions(code, stream)
+            if has_options or code != "inverse"
+            else {}
+        )
+        findings.append(
+            finding(key, stream, options=options, detail=hypothesis.detail)
+        )
     return tuple(findings)

@@ -62,7 +62,8 @@ class Hypothesis:
         }
         codes = dict.fromkeys((*self.parent, *self.child))
         return [
-            (code, streams[code in self.parent, code in self.child]) for code in codes
+            (code, streams[code in self.parent, code in self.child])
+            for code in codes
         ]
 
     @property
@@ -87,7 +88,9 @@ class Hypothesis:
             )
         if codes == EULER_ORDER:
             rotations = se3.in_other_order(se3.rotation_of(poses))
-            return se3.from_rotation_translation(rotations, se3.translation_of(poses))
+            return se3.from_rotation_translation(
+                rotations, se3.translation_of(poses)
+            )
         return se3.put_right(poses, **dict(CONVENTIONS[code] for code in codes))
 
     def undo(self, streams: StreamPair) -> StreamPair:
@@ -107,7 +110,9 @@ class Hypothesis:
 
         It fits equally well.
         """
-        return Hypothesis(_toggle_inverse(self.parent), _toggle_inverse(self.child))
+        return Hypothesis(
+            _toggle_inverse(self.parent), _toggle_inverse(self.child)
+        )
 
 
 def _toggle_inverse(codes: _Codes) -> _Codes:
@@ -154,7 +159,9 @@ class Readings:
         It does not if a fixed camera beside an arm is another cause of that shape.
         """
         is_fixed_camera = (
-            self.is_small and self.hypotheses[0].is_uninverted and self.shape > 0.0
+            self.is_small
+            and self.hypotheses[0].is_uninverted
+            and self.shape > 0.0
         )
         return self.by_shape != 0 and not is_fixed_camera
 
@@ -164,7 +171,10 @@ class Readings:
         if not second.is_uninverted:
             return self
         return replace(
-            self, hypotheses=(second, first), shape=-self.shape, paths=-self.paths
+            self,
+            hypotheses=(second, first),
+            shape=-self.shape,
+            paths=-self.paths,
         )
 
 
@@ -196,7 +206,10 @@ class Explanation:
     @property
     def may_be_uninverted(self) -> bool:
         """Whether both readings are possible, and in the first one both streams contain poses."""
-        return self.readings is not None and self.readings.hypotheses[0].is_uninverted
+        return (
+            self.readings is not None
+            and self.readings.hypotheses[0].is_uninverted
+        )
 
     @property
     def holds(self) -> bool:
@@ -233,7 +246,11 @@ PLAIN = CONVENTIONAL[0]
 # Usual mistakes. Hypotheses with both streams inverted are missing: they fit as well as those
 # with neither stream inverted.
 USUAL = [
-    *(usual for usual in CONVENTIONAL[1:] if ("inverse", "both") not in usual.mistakes),
+    *(
+        usual
+        for usual in CONVENTIONAL[1:]
+        if ("inverse", "both") not in usual.mistakes
+    ),
     Hypothesis(child=("left_handed",), axes=_MIRROR),
     Hypothesis(parent=("left_handed",), axes=_MIRROR),
     Hypothesis(child=EULER_ORDER),
@@ -248,7 +265,9 @@ def hypotheses_of_axes() -> Iterator[Hypothesis]:
     some of these hypotheses fit as well as that of inverted orientations.
     """
     flips = itertools.product((1, -1), repeat=3)
-    for order, signs in itertools.product(itertools.permutations(range(3)), flips):
+    for order, signs in itertools.product(
+        itertools.permutations(range(3)), flips
+    ):
         matrix = np.diag(signs) @ np.eye(3)[list(order)]
         if np.array_equal(matrix, np.eye(3)) or np.array_equal(matrix, _MIRROR):
             continue

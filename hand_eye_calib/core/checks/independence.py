@@ -135,9 +135,7 @@ def check_copies(
     )
     if residual_rad < _ROUNDING_RAD:
         severity = Severity.WARNING if are_exact else Severity.ERROR
-        text = (
-            f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
-        )
+        text = f"both streams agree to {angle(residual_rad)}, which two sensors hardly do"
         return [_doubt(text, severity, residual_rad=residual_rad)]
     if are_exact:
         return []
@@ -146,13 +144,19 @@ def check_copies(
         for computed, source in pairs
     )
     if excess > 1.0:
-        return [_doubt("the noise of both streams is unusually alike", more=excess)]
+        return [
+            _doubt("the noise of both streams is unusually alike", more=excess)
+        ]
     return []
 
 
-def _doubt(text: str, severity: Severity | None = None, **evidence: float) -> Finding:
+def _doubt(
+    text: str, severity: Severity | None = None, **evidence: float
+) -> Finding:
     """Return the finding "not_independent" with a text that names the evidence, and its values."""
-    return finding("not_independent", "both", severity, None, evidence=text, **evidence)
+    return finding(
+        "not_independent", "both", severity, None, evidence=text, **evidence
+    )
 
 
 def _within(computed: Trajectory, source: Trajectory) -> IntArray:
@@ -204,8 +208,12 @@ def _residual(motions: MotionPairs) -> float:
     angles = angles[is_clear]
     if len(motions) < MIN_PAIRS:
         return np.inf
-    X = se3.from_rotation_translation(align_rotation_vectors(motions), np.zeros(3))
-    residual_rad = quantile(np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL)
+    X = se3.from_rotation_translation(
+        align_rotation_vectors(motions), np.zeros(3)
+    )
+    residual_rad = quantile(
+        np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL
+    )
     return (
         residual_rad
         if residual_rad < _SMALL_SHARE * quantile(angles, USUAL)
@@ -221,11 +229,17 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     if the noise may be motion, or if a pose is missing.
     """
     intervals_ns = np.diff(computed.stamps_ns)
-    if len(computed) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(intervals_ns):
+    if len(computed) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(
+        intervals_ns
+    ):
         return 0.0
     of_computed = _second_differences(computed.poses)
-    of_source = _second_differences(source.at(computed.stamps_ns, straight=True))
-    of_source = of_source @ se3.nearest_rotation(of_source[:, 1].T @ of_computed[:, 1])
+    of_source = _second_differences(
+        source.at(computed.stamps_ns, straight=True)
+    )
+    of_source = of_source @ se3.nearest_rotation(
+        of_source[:, 1].T @ of_computed[:, 1]
+    )
     difference = of_source - of_computed
     arms = se3.skew(of_computed[:, 1])
     lever_arm = np.linalg.lstsq(
@@ -298,9 +312,13 @@ def check_drift(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
     """
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
     path_m = float(
-        np.linalg.norm(np.diff(se3.translation_of(path.poses), axis=0), axis=1).sum()
+        np.linalg.norm(
+            np.diff(se3.translation_of(path.poses), axis=0), axis=1
+        ).sum()
     )
-    aligned = _AlignedPositions.of(pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES], X)
+    aligned = _AlignedPositions.of(
+        pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES], X
+    )
     apart_m = median(aligned.distances_m)
     is_close = path_m >= _LONG_PATH_M and apart_m <= _LEAST_DRIFT * path_m
     is_steady = path_m >= _STEADY_PATH_M and _is_steady(aligned)
@@ -404,15 +422,20 @@ def _apart_in_windows(
     """Align points (N, 3) in each window of time, and return the median distance (m) of all."""
     # A window needs enough points, also of a long recording with few of its poses.
     window_ns = max(
-        round(_WINDOW_S * 1e9), round(2 * MIN_PAIRS * median(np.diff(stamps_ns)))
+        round(_WINDOW_S * 1e9),
+        round(2 * MIN_PAIRS * median(np.diff(stamps_ns))),
     )
     windows = (stamps_ns - stamps_ns[0]) // window_ns
-    _, firsts, counts = np.unique(windows, return_index=True, return_counts=True)
+    _, firsts, counts = np.unique(
+        windows, return_index=True, return_counts=True
+    )
     distances_m = []
     # Windows with equal numbers of points are aligned at once.
     for count in np.unique(counts[counts >= MIN_PAIRS]):
         rows = firsts[counts == count, None] + np.arange(count)
-        distances_m += medians(_alignment(points[rows], others[rows])[1]).tolist()
+        distances_m += medians(
+            _alignment(points[rows], others[rows])[1]
+        ).tolist()
     return median(distances_m) if distances_m else 0.0
 
 
@@ -426,7 +449,8 @@ def _is_difference_white(aligned: _AlignedPositions) -> bool:
     differences = _pose_differences(aligned)
     first = _size_of_changes(differences, 1)
     sizes = [
-        _size_of_changes(differences, round(time_s / interval_s)) for time_s in times_s
+        _size_of_changes(differences, round(time_s / interval_s))
+        for time_s in times_s
     ]
     return bool((np.array(sizes) < _WHITE_GROWTH * first).all())
 
@@ -438,10 +462,15 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
     are not compared.
     """
     streams = np.stack(
-        [_second_differences(Ts) for Ts in (pose_pairs.Ts_pw_p @ X, pose_pairs.Ts_cw_c)]
+        [
+            _second_differences(Ts)
+            for Ts in (pose_pairs.Ts_pw_p @ X, pose_pairs.Ts_cw_c)
+        ]
     )
     streams = streams * _is_calm(*streams)[:, None, None]
-    quarters = _upper_quarters(np.concatenate([streams, [streams[1] - streams[0]]]))
+    quarters = _upper_quarters(
+        np.concatenate([streams, [streams[1] - streams[0]]])
+    )
     # Positions and orientations of two quarters, (2, 2).
     of_noisier = quarters[:, :2].max(axis=1)
     shares = (quarters[:, 2].sum(axis=0) / of_noisier.sum(axis=0)) ** 0.5
@@ -454,7 +483,9 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
     is_parent_noisier = (of_parent > of_child)[:, None]
     streams = np.where(is_parent_noisier, streams[::-1], streams)
     factors, sigmas = _factors_of_noise(streams)
-    is_contained = (factors > _CONTAINED) & (factors > _CONTAINED_SIGMAS * sigmas)
+    is_contained = (factors > _CONTAINED) & (
+        factors > _CONTAINED_SIGMAS * sigmas
+    )
     is_foreign = factors + _CONTAINED_SIGMAS * sigmas < _CONTAINED
     return bool(is_contained[is_noise].any() and not is_foreign[is_noise].any())
 
@@ -516,14 +547,18 @@ def _pose_differences(aligned: _AlignedPositions) -> FloatArray:
     """
     rotations = se3.rotation_of(aligned.Ts_pw_c)
     # Without errors, the rotations from the parent's world to the child's world are constant.
-    between = se3.rotation_of(aligned.pose_pairs.Ts_cw_c) @ np.swapaxes(rotations, 1, 2)
+    between = se3.rotation_of(aligned.pose_pairs.Ts_cw_c) @ np.swapaxes(
+        rotations, 1, 2
+    )
     world = se3.nearest_rotation(between.sum(axis=0))
     turns = se3.rotation_log(world.T @ between)
     steps = se3.rotation_log(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2))
     angles = np.cumsum(np.pad(steps, ((1, 0), (0, 0))), axis=0)
     rates = np.gradient(angles, aligned.seconds, axis=0)
     constant = np.broadcast_to(np.eye(3), rotations.shape)
-    of_orientations = np.concatenate([constant, rotations, rates[:, :, None]], axis=2)
+    of_orientations = np.concatenate(
+        [constant, rotations, rates[:, :, None]], axis=2
+    )
     residuals = [
         _residuals(aligned.regressors(rotations), aligned.differences),
         _residuals(of_orientations, turns),
@@ -539,7 +574,9 @@ def _residuals(rows: FloatArray, targets: FloatArray) -> FloatArray:
     return targets - rows @ values
 
 
-def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _alignment(
+    points: FloatArray, others: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Align points (..., N, 3) robustly by a rotation and a translation.
 
     Returns
@@ -553,7 +590,9 @@ def _alignment(points: FloatArray, others: FloatArray) -> tuple[FloatArray, Floa
         from_mean = points - shares @ points
         others_from_mean = others - shares @ others
         weighted = weights[..., None] * from_mean
-        R = se3.nearest_rotation(np.swapaxes(weighted, -1, -2) @ others_from_mean)
+        R = se3.nearest_rotation(
+            np.swapaxes(weighted, -1, -2) @ others_from_mean
+        )
         aligned = others_from_mean @ np.swapaxes(R, -1, -2)
         distances_m = np.linalg.norm(from_mean - aligned, axis=-1)
         usual_m = 2.0 * medians(distances_m)[..., None] + 1e-9

@@ -100,7 +100,9 @@ def _check_turned(pairs: Mapping[str, StreamPair]) -> list[Finding]:
     better explanation counts.
     """
     turned = [_find_turn(name, pair) for name, pair in pairs.items()]
-    best = min(filter(None, turned), key=lambda turn: turn.unexplained, default=None)
+    best = min(
+        filter(None, turned), key=lambda turn: turn.unexplained, default=None
+    )
     if best is None:
         return []
     angle_rad = float(se3.rotation_angle(best.rotation))
@@ -144,7 +146,9 @@ def _unexplained(streams: StreamPair) -> float:
     shares = [1.0]
     for lag_s in LAGS_S:
         with suppress(NotEnoughDataError):
-            shares.append(fit_similarity(streams.pairs(lag_s, MAX_PAIRS)).unexplained)
+            shares.append(
+                fit_similarity(streams.pairs(lag_s, MAX_PAIRS)).unexplained
+            )
     return min(shares)
 
 
@@ -161,8 +165,12 @@ def _find_turn(name: str, streams: StreamPair) -> _TurnedPositions | None:
             continue
         positions = se3.translation_of(child.poses)
         turned = positions @ rotation.T
-        poses = se3.from_rotation_translation(se3.rotation_of(child.poses), turned)
-        unexplained = _unexplained(replace(streams, child=replace(child, poses=poses)))
+        poses = se3.from_rotation_translation(
+            se3.rotation_of(child.poses), turned
+        )
+        unexplained = _unexplained(
+            replace(streams, child=replace(child, poses=poses))
+        )
         if unexplained < HOLDS:
             return _TurnedPositions(
                 name, rotation, unexplained, are_earth_centred(positions)
@@ -181,10 +189,14 @@ def _fit_turn(streams: StreamPair, lag_s: float) -> FloatArray:
     parent_vectors = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
     child_vectors = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
     R_X = se3.nearest_rotation(parent_vectors.T @ child_vectors)
-    displacements = poses.Ts_cw_c[pairs.j, :3, 3] - poses.Ts_cw_c[pairs.i, :3, 3]
+    displacements = (
+        poses.Ts_cw_c[pairs.j, :3, 3] - poses.Ts_cw_c[pairs.i, :3, 3]
+    )
     to_parent = R_X @ np.swapaxes(poses.Ts_cw_c[pairs.i, :3, :3], 1, 2)
     # Derivatives with respect to the elements of W, row by row: (K, 3, 3, 3) to (K, 3, 9).
-    of_W = np.einsum("kab,kc->kabc", to_parent, displacements).reshape(len(pairs), 3, 9)
+    of_W = np.einsum("kab,kc->kabc", to_parent, displacements).reshape(
+        len(pairs), 3, 9
+    )
     of_lever_arm = -(se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3))
     rows = np.concatenate([of_W, of_lever_arm], axis=2)
     target = se3.translation_of(pairs.Ts_parenti_parentj)

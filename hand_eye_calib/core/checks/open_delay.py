@@ -17,7 +17,12 @@ import numpy as np
 from hand_eye_calib.core.assessment.common_mode import FLOOR_TRAVEL_S
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.checks.fault_regression import Regression
-from hand_eye_calib.core.checks.findings import LIMITS, Finding, Severity, finding
+from hand_eye_calib.core.checks.findings import (
+    LIMITS,
+    Finding,
+    Severity,
+    finding,
+)
 from hand_eye_calib.core.geometry import se3
 
 _STREAMS = ("child", "parent")
@@ -63,7 +68,9 @@ def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
     """
     # A late child is nearly the same as an early parent, so only one of both counts.
     delays = [_of_stream(fast, stream, X) for stream in _STREAMS]
-    return max(delays, key=lambda delay: float(np.trace(delay.covariance[:3, :3])))
+    return max(
+        delays, key=lambda delay: float(np.trace(delay.covariance[:3, :3]))
+    )
 
 
 def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:

@@ -8,7 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import SimilarityFit, fit_similarity
+from hand_eye_calib.core.alignment.similarity import (
+    SimilarityFit,
+    fit_similarity,
+)
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.errors import NotEnoughDataError
@@ -18,7 +21,11 @@ from hand_eye_calib.core.checks.agreement import MAX_SHORT_MOTIONS, SHORT_S
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.stream_pair import MAX_ROTATION_RAD, MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
 # Shares of the poses before the time at which a recording is split in two.
@@ -67,11 +74,17 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
         if min(map(len, parts)) < MIN_PAIRS:
             continue
         first, second = (
-            se3.from_rotation_translation(align_rotation_vectors(part), np.zeros(3))
+            se3.from_rotation_translation(
+                align_rotation_vectors(part), np.zeros(3)
+            )
             for part in parts
         )
-        by_own = max(_unexplained(parts[0], first), _unexplained(parts[1], second))
-        by_other = min(_unexplained(parts[0], second), _unexplained(parts[1], first))
+        by_own = max(
+            _unexplained(parts[0], first), _unexplained(parts[1], second)
+        )
+        by_other = min(
+            _unexplained(parts[0], second), _unexplained(parts[1], first)
+        )
         if by_own >= _SOUND_PART or by_other <= max(_OTHER_PART, 3.0 * by_own):
             continue
         at_s = _seconds_at(pose_pairs.stamps_ns, split)
@@ -81,7 +94,9 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
     return []
 
 
-def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
+def check_other_extrinsic(
+    pose_pairs: PosePairs, X: FloatArray
+) -> list[Finding]:
     """Return the finding that a part of a recording has another extrinsic, or none.
 
     On flat ground one rotation explains the rotations before and after an exchange of the streams,
@@ -95,15 +110,22 @@ def check_other_extrinsic(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]
         Extrinsic of the recording.
     """
     motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
-    lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
+    lengths_m = np.linalg.norm(
+        se3.translation_of(motions.Ts_parenti_parentj), axis=1
+    )
     motions = motions[lengths_m > _MOVING_SHARE * median(lengths_m)]
-    if len(motions) < MIN_PAIRS or (_unexplained_path(motions, X) < _OTHER_SHARE).all():
+    if (
+        len(motions) < MIN_PAIRS
+        or (_unexplained_path(motions, X) < _OTHER_SHARE).all()
+    ):
         return []
     block_of = motions.i * _EXCHANGE_BLOCKS // len(pose_pairs)
     ends = (block_of < _END_BLOCKS, block_of >= _EXCHANGE_BLOCKS - _END_BLOCKS)
     fits = [_own_fit(motions[is_end]) for is_end in ends]
     for candidate in (X, *(fit.T_parent_child for fit in fits if fit)):
-        cut, is_other = _other_part(_unexplained_path(motions, candidate), block_of)
+        cut, is_other = _other_part(
+            _unexplained_path(motions, candidate), block_of
+        )
         own = _own_fit(motions[is_other]) if is_other.any() else None
         if own is None:
             continue
@@ -124,7 +146,9 @@ def _seconds_at(stamps_ns: IntArray, row: int) -> float:
     return float(stamps_ns[row] - stamps_ns[0]) * 1e-9
 
 
-def _parts_turned(first: FloatArray, second: FloatArray, at_s: float) -> Finding:
+def _parts_turned(
+    first: FloatArray, second: FloatArray, at_s: float
+) -> Finding:
     """Return the finding that the extrinsics (4, 4) of two parts have different rotations."""
     between = se3.rotation_of(first).T @ se3.rotation_of(second)
     turned_rad = float(se3.rotation_angle(between))
@@ -145,7 +169,9 @@ def _exchanged(motions: MotionPairs) -> MotionPairs:
 def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
     """Return the shares (K,) of the displacements that an extrinsic X (4, 4) leaves unexplained."""
     residuals_m, _ = motions.residuals(X)
-    lengths_m = np.linalg.norm(se3.translation_of(motions.Ts_parenti_parentj), axis=1)
+    lengths_m = np.linalg.norm(
+        se3.translation_of(motions.Ts_parenti_parentj), axis=1
+    )
     return np.asarray(
         np.linalg.norm(residuals_m, axis=1) / np.maximum(lengths_m, 1e-12)
     )
@@ -165,7 +191,9 @@ def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
     return fit if is_sound else None
 
 
-def _other_part(shares: FloatArray, block_of: IntArray) -> tuple[int, BoolArray]:
+def _other_part(
+    shares: FloatArray, block_of: IntArray
+) -> tuple[int, BoolArray]:
     """Return the block that another part starts or ends in, and a mask (K,) of that part.
 
     ``shares`` (K,) are the unexplained shares of motions, and ``block_of`` (K,) their blocks. The
@@ -192,7 +220,9 @@ def _other_part(shares: FloatArray, block_of: IntArray) -> tuple[int, BoolArray]
     return cut, is_other
 
 
-def _check_exchanged(motions: MotionPairs, stamps_ns: IntArray) -> Finding | None:
+def _check_exchanged(
+    motions: MotionPairs, stamps_ns: IntArray
+) -> Finding | None:
     """Return the finding that parent and child are exchanged from some time on, or None.
 
     One rotation R maps rotation vectors of the child to those of the parent. After an exchange it

@@ -78,7 +78,9 @@ class StepVelocities(NamedTuple):
         return np.linalg.norm(self.values, axis=1)
 
 
-def step_velocities(trajectory: Trajectory) -> tuple[StepVelocities, StepVelocities]:
+def step_velocities(
+    trajectory: Trajectory,
+) -> tuple[StepVelocities, StepVelocities]:
     """Compute the linear (m/s) and the angular (rad/s) velocities of the steps of a stream."""
     seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
     rotations = se3.rotation_of(trajectory.poses)
@@ -94,7 +96,9 @@ def step_velocities(trajectory: Trajectory) -> tuple[StepVelocities, StepVelocit
 def _excess(velocities: FloatArray) -> FloatArray:
     """Return the distances (N,) of velocities (N, 3) from the median of five around each."""
     # Both ends are continued by their mirror image.
-    padded = np.concatenate([velocities[2:0:-1], velocities, velocities[-2:-4:-1]])
+    padded = np.concatenate(
+        [velocities[2:0:-1], velocities, velocities[-2:-4:-1]]
+    )
     shifted = [padded[shift : shift + len(velocities)] for shift in range(5)]
     medians = np.partition(shifted, 2, axis=0)[2]
     excesses = np.linalg.norm(velocities - medians, axis=1)
@@ -168,7 +172,9 @@ def _find_interpolation(
         rates_rad_s[1:], axis=1
     )
     positions = se3.translation_of(trajectory.poses)
-    share, are_measured = _straight_share(positions, changes_rad_s < limits_rad_s)
+    share, are_measured = _straight_share(
+        positions, changes_rad_s < limits_rad_s
+    )
     if share <= _STRAIGHT_SHARE or not are_measured.any():
         return None
     # The velocity changes at the measured positions. The true path between two of them is an arc.
@@ -180,7 +186,11 @@ def _find_interpolation(
     interval_s = trajectory.interval_s / (1.0 - share)
     displaced_m = median(changes[are_measured]) * interval_s / 8.0
     return graded(
-        "interpolated", stream, displaced_m, share=share, displaced_m=displaced_m
+        "interpolated",
+        stream,
+        displaced_m,
+        share=share,
+        displaced_m=displaced_m,
     )
 
 
@@ -188,7 +198,9 @@ def _find_propagation(
     trajectory: Trajectory, velocities: Sequence[StepVelocities], stream: str
 ) -> Finding | None:
     """Return the finding about predicted poses that jump back at regular corrections, or None."""
-    stamps_s: FloatArray = (trajectory.stamps_ns[1:] - trajectory.stamps_ns[0]) * 1e-9
+    stamps_s: FloatArray = (
+        trajectory.stamps_ns[1:] - trajectory.stamps_ns[0]
+    ) * 1e-9
     steps_s = np.diff(trajectory.stamps_ns) * 1e-9
     for _, excess in velocities:
         for factor in _CORRECTIONS:
@@ -217,8 +229,12 @@ def _regular_interval(stamps_s: FloatArray, trajectory: Trajectory) -> float:
     are_usual = np.abs(intervals_s - usual_s) < _REGULAR_POSES * step_s
     # An estimator corrects its poses during most of the recording. Regular jumps during a few
     # seconds are noise.
-    is_long = len(stamps_s) * usual_s > _MIN_DURATION_SHARE * trajectory.duration_s
-    is_regular = usual_s > _MIN_INTERVAL * step_s and are_usual.mean() > _REGULAR_SHARE
+    is_long = (
+        len(stamps_s) * usual_s > _MIN_DURATION_SHARE * trajectory.duration_s
+    )
+    is_regular = (
+        usual_s > _MIN_INTERVAL * step_s and are_usual.mean() > _REGULAR_SHARE
+    )
     return usual_s if is_long and is_regular else 0.0
 
 

@@ -84,7 +84,9 @@ def evidence_for_inverse(
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
         shortest, path_of_origin = _shortest_path(poses, order)
         shortest_of_inverse, _ = _shortest_path(se3.inverse(poses), order)
-        logs.append(np.log([shortest / shortest_of_inverse, shortest / path_of_origin]))
+        logs.append(
+            np.log([shortest / shortest_of_inverse, shortest / path_of_origin])
+        )
     paths, relative_to_origin = np.mean(logs, axis=0)
     looks_at_a_point = relative_to_origin < np.log(0.5)
     if looks_at_a_point and paths > 0.0:
@@ -102,7 +104,9 @@ def _evidence_of_lever_arms(corrected: StreamPair, fit: SimilarityFit) -> float:
     pairs = corrected.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
     Ts = np.array([fit.T_parent_child, medians(np.moveaxis(worlds, 0, 2))])
-    arms_m = np.maximum(np.linalg.norm(se3.translation_of(Ts), axis=1), _MIN_ARM_M)
+    arms_m = np.maximum(
+        np.linalg.norm(se3.translation_of(Ts), axis=1), _MIN_ARM_M
+    )
     angles_rad = se3.rotation_angle(se3.rotation_of(Ts))
     if angles_rad[np.argmin(arms_m)] <= _SAME_FRAME_RAD:
         return 0.0

@@ -3,7 +3,10 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
+from hand_eye_calib.core.alignment.rate_correlation import (
+    Correlation,
+    correlate_rates,
+)
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing import motion_pairs
@@ -69,8 +72,6 @@ class StreamPair:
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
-            text = (
-                f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
-            )
+            text = f"the streams have only {len(pairs)} motions over {lag_s:g} s in common"
             raise NotEnoughDataError(text)
         return pairs

@@ -11,7 +11,11 @@ from hand_eye_calib.core.base.stats import median, quantile
 from hand_eye_calib.core.checks.findings import LIMITS, Finding, finding, graded
 from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import SAME_POSE, Trajectory, repetitions
+from hand_eye_calib.core.geometry.trajectory import (
+    SAME_POSE,
+    Trajectory,
+    repetitions,
+)
 from hand_eye_calib.core.pairing.motion_pairs import find_leap
 
 # A gap is longer than the option max_gap, and longer than this multiple of the median interval.
@@ -119,7 +123,9 @@ def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
 
 
 def check_stream(
-    trajectory: Trajectory, stream: str, max_gap_s: float = CalibratorConfig.max_gap
+    trajectory: Trajectory,
+    stream: str,
+    max_gap_s: float = CalibratorConfig.max_gap,
 ) -> list[Finding]:
     """Return the findings about one stream of poses.
 
@@ -143,7 +149,9 @@ def check_stream(
         fast = _JUMP_SPEEDS * quantile(steps.speeds, USUAL)
         are_jumps |= steps.excess > max(usual, fast)
     share = float(are_jumps.mean())
-    jumps = graded("jumps", stream, share, options={"method": "dnlo"}, share=share)
+    jumps = graded(
+        "jumps", stream, share, options={"method": "dnlo"}, share=share
+    )
     findings += check_sampling(trajectory, velocities, stream)
     return [*findings, jumps] if jumps else findings
 
@@ -163,7 +171,9 @@ def check_positions(
         longest_s = float(intervals_s.max())
         n_gaps = int(gaps.sum())
         findings = [
-            finding("gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share)
+            finding(
+                "gaps", stream, gaps=n_gaps, longest_s=longest_s, share=share
+            )
         ]
     if apart_m := _interleaved(trajectory):
         return [*findings, finding("interleaved", stream, distance_m=apart_m)]
@@ -171,8 +181,12 @@ def check_positions(
         _grid_step(column) for column in se3.translation_of(trajectory.poses).T
     )
     # In a stream without orientations, rounding is noise like any other: never an error.
-    most = np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
-    coarse = graded("coarse_positions", stream, min(step_m, most), step_m=step_m)
+    most = (
+        np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
+    )
+    coarse = graded(
+        "coarse_positions", stream, min(step_m, most), step_m=step_m
+    )
     return [*findings, coarse] if coarse else findings
 
 
@@ -198,7 +212,9 @@ def _interleaved(trajectory: Trajectory) -> float:
         deviations.append(
             positions[lag:-lag] - before - share[:, None] * (after - before)
         )
-    roughness_m = [median(np.linalg.norm(vectors, axis=1)) for vectors in deviations]
+    roughness_m = [
+        median(np.linalg.norm(vectors, axis=1)) for vectors in deviations
+    ]
     # Positions that alternate are rough from pose to pose, and smooth over whole periods.
     period = 2 + int(np.argmin(roughness_m[1:]))
     if roughness_m[0] < max(
@@ -206,15 +222,22 @@ def _interleaved(trajectory: Trajectory) -> float:
     ):
         return 0.0
     in_world = deviations[0]
-    in_sensor = np.einsum("kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world)
+    in_sensor = np.einsum(
+        "kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world
+    )
     # The levels repeat with the period, in the axes of the world or in those of the sensor.
     for vectors in (in_world, in_sensor):
         n_windows = len(vectors) // (_PERIODS_OF_LEVEL * period)
         n_used = n_windows * _PERIODS_OF_LEVEL * period
-        windows = vectors[:n_used].reshape(n_windows, _PERIODS_OF_LEVEL, period, 3)
+        windows = vectors[:n_used].reshape(
+            n_windows, _PERIODS_OF_LEVEL, period, 3
+        )
         levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
         total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-        if median(levels / np.maximum(total, 1e-300)) >= _MIN_EXPLAINED_BY_LEVELS:
+        if (
+            median(levels / np.maximum(total, 1e-300))
+            >= _MIN_EXPLAINED_BY_LEVELS
+        ):
             return roughness_m[0]
     return 0.0
 
@@ -261,7 +284,12 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         )
         if tilt_rad > _MIN_TILT_RAD:
             return [
-                finding("flat", name, other=other, tilt_deg=float(np.degrees(tilt_rad)))
+                finding(
+                    "flat",
+                    name,
+                    other=other,
+                    tilt_deg=float(np.degrees(tilt_rad)),
+                )
             ]
     return []
 
@@ -277,7 +305,13 @@ def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
     }
     durations_s = {"parent": parent.duration_s, "child": child.duration_s}
     findings = (
-        graded("frozen", name, share, share=share, frozen_s=share * durations_s[name])
+        graded(
+            "frozen",
+            name,
+            share,
+            share=share,
+            frozen_s=share * durations_s[name],
+        )
         for name, share in shares.items()
     )
     return [*filter(None, findings)]
@@ -299,7 +333,9 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
         n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
         edges_ns = np.linspace(from_ns, until_ns, n_parts + 1).astype(np.int64)
         for first_ns, last_ns in itertools.pairwise(edges_ns.tolist()):
-            is_part = (other.stamps_ns >= first_ns) & (other.stamps_ns <= last_ns)
+            is_part = (other.stamps_ns >= first_ns) & (
+                other.stamps_ns <= last_ns
+            )
             if _moves(other[is_part], usual_m_s):
                 frozen_ns += last_ns - first_ns
     return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
@@ -310,9 +346,13 @@ def _moves(part: Trajectory, usual_m_s: float) -> bool:
     if len(part) < 2:
         return False
     positions = se3.translation_of(part.poses)
-    angles = se3.rotation_log(part.poses[0, :3, :3].T @ se3.rotation_of(part.poses))
+    angles = se3.rotation_log(
+        part.poses[0, :3, :3].T @ se3.rotation_of(part.poses)
+    )
     least_m = max(_MOVES_M, _MOVES_SHARE * usual_m_s * part.duration_s)
-    return _exceeds(positions - positions[0], least_m) or _exceeds(angles, _MOVES_RAD)
+    return _exceeds(positions - positions[0], least_m) or _exceeds(
+        angles, _MOVES_RAD
+    )
 
 
 def _exceeds(away: FloatArray, least: float) -> bool:
@@ -406,8 +446,12 @@ def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
     if len(seconds) < 4:
         return 0.0, 0.0
     intervals_s = np.diff(seconds.stamps_ns)[:, None] * 1e-9
-    velocities = np.diff(se3.translation_of(seconds.poses), axis=0) / intervals_s
-    changes = np.diff(velocities, axis=0) / (0.5 * (intervals_s[1:] + intervals_s[:-1]))
+    velocities = (
+        np.diff(se3.translation_of(seconds.poses), axis=0) / intervals_s
+    )
+    changes = np.diff(velocities, axis=0) / (
+        0.5 * (intervals_s[1:] + intervals_s[:-1])
+    )
     speed = quantile(np.linalg.norm(velocities, axis=1), USUAL)
     change = quantile(np.linalg.norm(changes, axis=1), USUAL)
     return speed, change

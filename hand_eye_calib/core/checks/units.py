@@ -7,7 +7,12 @@ from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 
 # Names of the units of length that are detected, by their size in metres.
-_UNITS = {1e-3: "millimetres", 1e-2: "centimetres", 0.0254: "inches", 0.3048: "feet"}
+_UNITS = {
+    1e-3: "millimetres",
+    1e-2: "centimetres",
+    0.0254: "inches",
+    0.3048: "feet",
+}
 
 # A scale equals a unit if their difference is within the largest of two limits.
 # Limit in standard deviations of the scale.
@@ -59,7 +64,10 @@ def in_other_units(
     # both factors is compared first.
     totals = (scale * known, scale) if 0.5 < known < 2.0 else (scale,)
     for total in totals:
-        values: dict[str, Any] = {"scale": total, "sigma": sigma * total / scale}
+        values: dict[str, Any] = {
+            "scale": total,
+            "sigma": sigma * total / scale,
+        }
         unit = _unit_of(total, values["sigma"])
         if unit and total > 1.0:
             return _parent_or_child(unit, values, parent, child)

@@ -53,13 +53,16 @@ class Attempt:
     @property
     def is_usable(self) -> bool:
         """Whether no finding forbids the use of the result."""
-        return not any(finding.makes_unusable for finding in self.check.findings)
+        return not any(
+            finding.makes_unusable for finding in self.check.findings
+        )
 
     @property
     def n_objections(self) -> int:
         """Number of findings graver than a note."""
         return sum(
-            finding.severity is not Severity.NOTE for finding in self.check.findings
+            finding.severity is not Severity.NOTE
+            for finding in self.check.findings
         )
 
     @property
@@ -98,9 +101,15 @@ class Attempt:
 
     def with_doubts(self, doubts: Collection[Finding]) -> "Attempt":
         """Return the attempt with further findings about options that were set automatically."""
-        return self.with_findings((*self.check.findings, *doubts)) if doubts else self
+        return (
+            self.with_findings((*self.check.findings, *doubts))
+            if doubts
+            else self
+        )
 
-    def with_messages(self, options: Options, messages: Collection[str]) -> "Attempt":
+    def with_messages(
+        self, options: Options, messages: Collection[str]
+    ) -> "Attempt":
         """Return the attempt with options that were set automatically, and warnings about them."""
         warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
         calibration = replace(self.calibration, warnings=warnings)

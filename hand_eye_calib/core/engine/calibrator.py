@@ -169,7 +169,9 @@ class Calibrator:
     """
 
     def __init__(
-        self, config: CalibratorConfig | None = None, limits: BufferLimits | None = None
+        self,
+        config: CalibratorConfig | None = None,
+        limits: BufferLimits | None = None,
     ) -> None:
         self.config = config or CalibratorConfig()
         self._limits = limits or BufferLimits()
@@ -279,7 +281,8 @@ class Calibrator:
             If a value is not finite or the quaternion is not of unit length.
         """
         is_unit = (
-            abs(math.hypot(*quat_xyzw) - 1.0) <= trajectory.QUATERNION_NORM_TOLERANCE
+            abs(math.hypot(*quat_xyzw) - 1.0)
+            <= trajectory.QUATERNION_NORM_TOLERANCE
         )
         if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
             # Raise InputError with the reason.
@@ -309,7 +312,9 @@ class Calibrator:
             parent_names=snapshots.names_of(
                 config, "parent", parent.frame, parent.world
             ),
-            child_names=snapshots.names_of(config, "child", child.frame, child.world),
+            child_names=snapshots.names_of(
+                config, "child", child.frame, child.world
+            ),
             time_offset=self._time_offset,
         )
 
@@ -374,8 +379,13 @@ class Calibrator:
         if len(pairs):
             self._kept_parts.append(pairs)
             if sum(map(len, self._kept_parts)) > config.max_pairs:
-                self._kept_parts = [snapshots.downsample(self._kept, config.max_pairs)]
-        is_alone = max(parent.stamps_ns[0], child.stamps_ns[0] + offset_ns) > horizon_ns
+                self._kept_parts = [
+                    snapshots.downsample(self._kept, config.max_pairs)
+                ]
+        is_alone = (
+            max(parent.stamps_ns[0], child.stamps_ns[0] + offset_ns)
+            > horizon_ns
+        )
         parent.drop(horizon_ns, unpaired=is_alone)
         child.drop(horizon_ns - offset_ns, unpaired=is_alone)
 

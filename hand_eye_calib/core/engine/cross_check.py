@@ -14,7 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from hand_eye_calib.core.assessment.covariance import Assessment
-from hand_eye_calib.core.assessment.second_opinion import assess_robust, second_opinions
+from hand_eye_calib.core.assessment.second_opinion import (
+    assess_robust,
+    second_opinions,
+)
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.config import METHODS, CalibratorConfig
 from hand_eye_calib.core.base.stats import MEDIAN_NORMAL, median
@@ -92,7 +95,9 @@ def cross_checked(
     )
 
 
-def _unconfirmed(result: Calibration, others: Sequence[Assessment]) -> BoolArray:
+def _unconfirmed(
+    result: Calibration, others: Sequence[Assessment]
+) -> BoolArray:
     """Return a mask (6,) of the axes that the result determines and no other estimate does."""
     # A result with a reference uses the most informative motions. Other motions may determine fewer
     # axes.
@@ -112,10 +117,14 @@ def answers_of_whole(
     A stride is the number of poses from the start to the end of a motion.
     """
     scaled = pose_pairs.child_scaled(result.scale)
-    return second_opinions(scaled.Ts_pw_p, scaled.Ts_cw_c, result.T_parent_child)
+    return second_opinions(
+        scaled.Ts_pw_p, scaled.Ts_cw_c, result.T_parent_child
+    )
 
 
-def answers_of_halves(result: Calibration, pose_pairs: PosePairs) -> list[Assessment]:
+def answers_of_halves(
+    result: Calibration, pose_pairs: PosePairs
+) -> list[Assessment]:
     """Estimate X from each half of the recording that has enough poses.
 
     The estimates use the scale of the result, and the reference of the result if it has one.
@@ -191,7 +200,9 @@ def compare_answers(
         for name, column in columns.items():
             if np.isfinite(sigmas[index]) and np.isfinite(column[index]):
                 values[name] = float(column[index])
-        scatter[axis] = AxisScatter(**values, is_confirmed=not unconfirmed[index])
+        scatter[axis] = AxisScatter(
+            **values, is_confirmed=not unconfirmed[index]
+        )
     return scatter
 
 
@@ -210,9 +221,13 @@ def _scatter_of_halves(
     if len(halves) != 2:
         return np.full(6, np.nan), np.full(6, np.nan)
     first, second = halves
-    between, joint = _distance_and_sigma(first.T_parent_child, first.sigmas, second)
+    between, joint = _distance_and_sigma(
+        first.T_parent_child, first.sigmas, second
+    )
     half_sigmas = np.maximum([first.sigmas, second.sigmas], _ROUNDING)
-    are_alike = half_sigmas.max(axis=0) < _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
+    are_alike = half_sigmas.max(
+        axis=0
+    ) < _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
     between = np.where(are_alike, between, np.nan)
     # The result is about the mean of both halves, whose standard deviation is half of that of the
     # difference. The covariances of the halves lack the allowance. If the result comes from a noise

@@ -28,7 +28,10 @@ from hand_eye_calib.core.base.text import parse_targets
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.noise import estimator as adaptive_estimator
-from hand_eye_calib.core.noise.estimator import AdaptiveSolution, NoiseModelError
+from hand_eye_calib.core.noise.estimator import (
+    AdaptiveSolution,
+    NoiseModelError,
+)
 from hand_eye_calib.core.noise.increments import SYSTEMATIC
 from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import (
@@ -36,7 +39,11 @@ from hand_eye_calib.core.pairing.motion_pairs import (
     PosePairs,
     motion_pairs,
 )
-from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
@@ -220,7 +227,9 @@ def calibration_of(
     """
     dofs = fused.observability
     out_of_reach = OUT_OF_REACH.get(fields.get("measured", "poses"), ())
-    unobservable = {dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE}
+    unobservable = {
+        dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE
+    }
     status = SolveStatus.OK
     if not solution.converged:
         status = SolveStatus.NOT_CONVERGED
@@ -233,7 +242,11 @@ def calibration_of(
         names = ", ".join(by_prior)
         warning = f"{names} of the child sensor: mostly from the prior, not the motion"
         warnings = (warning, *warnings)
-    defaults = {"method": "adaptive", "backend": "fast", "stamp_ns": int(stamps_ns[-1])}
+    defaults = {
+        "method": "adaptive",
+        "backend": "fast",
+        "stamp_ns": int(stamps_ns[-1]),
+    }
     return Calibration(
         T_parent_child=fused.T_parent_child,
         covariance_measured=fused.cov_parent_child_in_child,
@@ -283,7 +296,9 @@ def solve_poses(
     require_backend(config.method, config.backend)
     scaled = pose_pairs.child_scaled(scale)
     if config.method in ("auto", "adaptive"):
-        solved = _solve_stream(scaled, config, is_clock_free=time_offset is not None)
+        solved = _solve_stream(
+            scaled, config, is_clock_free=time_offset is not None
+        )
     else:
         solved = _solve_pairs(scaled, config)
     spread = solved.spread + _spread_of_scale_and_offset(
@@ -319,7 +334,9 @@ def _spread_of_scale_and_offset(
         relative_sigma = scale_fit.scale_sigma / scale_fit.scale
         spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
     # If the noise model estimates the time offset, its covariance contains the uncertainty already.
-    has_offset = isinstance(solution, AdaptiveSolution) and solution.time_offset_s
+    has_offset = (
+        isinstance(solution, AdaptiveSolution) and solution.time_offset_s
+    )
     if time_offset and time_offset.fit and not has_offset:
         by_offset = time_offset.fit.sensitivity[:, 1]
         spread += np.outer(by_offset, by_offset) * time_offset.sigma_s**2
@@ -354,8 +371,12 @@ def _solve_stream(
     is_auto = config.method == "auto"
     with_dnlo = replace(config, method="dnlo")
     if is_auto and config.reference != "auto":
-        reason = f"auto: dnlo, because the user set reference {config.reference}"
-        return replace(_solve_pairs(pose_pairs, with_dnlo), method_reason=reason)
+        reason = (
+            f"auto: dnlo, because the user set reference {config.reference}"
+        )
+        return replace(
+            _solve_pairs(pose_pairs, with_dnlo), method_reason=reason
+        )
     # The noise model does not estimate a scale or a time offset that the user set to a number. It
     # refines a time offset that is "estimate".
     is_fixed = {
@@ -397,7 +418,9 @@ def _solve_stream(
 def _with_opinions(dnlo: Solved, pose_pairs: PosePairs, reason: str) -> Solved:
     """Return a solution of DNLO that replaces one of the noise model, with second opinions."""
     T_parent_child = dnlo.solution.T_parent_child
-    opinions = second_opinions(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, T_parent_child)
+    opinions = second_opinions(
+        pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, T_parent_child
+    )
     return replace(dnlo, method_reason=reason, opinions=opinions)
 
 
@@ -414,7 +437,9 @@ def _of_model(
     """
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
-    Ts_cw_c = child.shifted(solution.time_offset_s).at(stamps_ns, extrapolate=True)
+    Ts_cw_c = child.shifted(solution.time_offset_s).at(
+        stamps_ns, extrapolate=True
+    )
     spread, warnings = possible_shift(solution.part_products, solution.misfit)
     jumps = float(np.mean(solution.jumps))
     if jumps > _MAX_JUMP_SHARE:
@@ -426,7 +451,9 @@ def _of_model(
     return Solved(
         solution=solution,
         assessment=covariance.assess_adaptive(pose_pairs, solution),
-        opinions=second_opinions(pose_pairs.Ts_pw_p, Ts_cw_c, solution.T_parent_child),
+        opinions=second_opinions(
+            pose_pairs.Ts_pw_p, Ts_cw_c, solution.T_parent_child
+        ),
         method="adaptive",
         reference="increments",
         pairs=motion_pairs(pose_pairs.Ts_pw_p, Ts_cw_c, "B1"),
@@ -466,7 +493,10 @@ def _solve_pairs(
         computed if the reference is ``auto``.
     """
     method = Method(
-        config.method, config.threshold, config.min_inlier_fraction, config.backend
+        config.method,
+        config.threshold,
+        config.min_inlier_fraction,
+        config.backend,
     )
     reference = config.reference
     reason = ""
@@ -478,7 +508,9 @@ def _solve_pairs(
         reference = best.reference
         reason = f"{reference}: motions over this number of poses have the smallest covariance"
     elif reference == "auto":
-        from hand_eye_calib.core.assessment.reference_selection import select_reference
+        from hand_eye_calib.core.assessment.reference_selection import (
+            select_reference,
+        )
 
         choice = select_reference(
             pose_pairs, replace(method, backend="fast"), solution=adaptive

@@ -60,8 +60,12 @@ class Kind:
         """
         for name, kind in KINDS_OF_OPTIONS.items():
             if getattr(config, name) and kind != config.measured:
-                words = [word for word in MEASURES if MEASURES[word].kind == kind]
-                raise ConfigError(f"{name} needs parent_measures {' or '.join(words)}")
+                words = [
+                    word for word in MEASURES if MEASURES[word].kind == kind
+                ]
+                raise ConfigError(
+                    f"{name} needs parent_measures {' or '.join(words)}"
+                )
         for name, values in self.allowed.items():
             value = getattr(config, name)
             if value not in values:

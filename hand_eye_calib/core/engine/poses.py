@@ -9,7 +9,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import check_model_scale
-from hand_eye_calib.core.checks.findings import Severity, answered, gravest_first
+from hand_eye_calib.core.checks.findings import (
+    Severity,
+    answered,
+    gravest_first,
+)
 from hand_eye_calib.core.engine.cross_check import cross_checked
 from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.kinds import Kind
@@ -36,7 +40,9 @@ def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     return solved.calibration()
 
 
-def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+def check(
+    snapshot: Snapshot, calibration: Calibration | None = None
+) -> CheckResult:
     """Check two streams of poses.
 
     Parameters
@@ -59,9 +65,13 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
         are_exact=config.parent_kind == config.child_kind == "exact",
     )
     obsolete = _obsolete_codes(snapshot, calibration)
-    findings = [finding for finding in result.findings if finding.code not in obsolete]
+    findings = [
+        finding for finding in result.findings if finding.code not in obsolete
+    ]
     if calibration and config.scale == "none":
-        findings += check_model_scale(calibration.scale, calibration.scale_sigma)
+        findings += check_model_scale(
+            calibration.scale, calibration.scale_sigma
+        )
     findings = answered(findings, config)
     if INVERSIONS & config.given:
         # The user has decided whether both streams are inverse.
@@ -74,12 +84,16 @@ def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckRe
     return replace(
         result,
         findings=gravest_first(findings),
-        open_covariance=_limited_by_prior(result.open_covariance, config, calibration),
+        open_covariance=_limited_by_prior(
+            result.open_covariance, config, calibration
+        ),
     )
 
 
 def _limited_by_prior(
-    covariance: FloatArray, config: CalibratorConfig, calibration: Calibration | None
+    covariance: FloatArray,
+    config: CalibratorConfig,
+    calibration: Calibration | None,
 ) -> FloatArray:
     """Return a covariance (6, 6) whose standard deviations are at most those of the priors.
 
@@ -113,7 +127,9 @@ def _extrinsic_estimate(
     return checking.ExtrinsicEstimate(calibration.T_parent_child, sigmas)
 
 
-def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[str]:
+def _obsolete_codes(
+    snapshot: Snapshot, calibration: Calibration | None
+) -> set[str]:
     """Return the codes of findings that do not apply to this snapshot or to this result."""
     obsolete = set()
     if len(snapshot.kept):
@@ -123,7 +139,9 @@ def _obsolete_codes(snapshot: Snapshot, calibration: Calibration | None) -> set[
     # result determines all of them, the motion turns about two axes.
     if calibration:
         unobserved = {DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR}
-        if unobserved.isdisjoint(dof.verdict for dof in calibration.observability[:3]):
+        if unobserved.isdisjoint(
+            dof.verdict for dof in calibration.observability[:3]
+        ):
             obsolete.add("one_axis")
     return obsolete
 

@@ -84,7 +84,9 @@ def choose(
     ]
     options = [_options_of(findings) for findings in findings_of_readings]
     difference = _loss_difference(pairs_of(options[0]), pairs_of(options[1]))
-    has_late_stamps = any(suspect.code == "arrival" for suspect in result.findings)
+    has_late_stamps = any(
+        suspect.code == "arrival" for suspect in result.findings
+    )
     index = decide(readings, difference, has_late_stamps)
     # Whether the first reading inverts no stream.
     can_be_right = readings.hypotheses[0].is_uninverted
@@ -129,7 +131,12 @@ def decide(
         by_noise = 0
     choice = _vote(readings, by_noise)
     can_be_right = readings.hypotheses[0].is_uninverted
-    if choice == 1 and can_be_right and has_late_stamps and readings.by_shape <= 0:
+    if (
+        choice == 1
+        and can_be_right
+        and has_late_stamps
+        and readings.by_shape <= 0
+    ):
         # An excavator with late stamps was read as inverse, 5 m off.
         return None
     if choice == 0 and can_be_right:
@@ -176,7 +183,10 @@ def _loss_difference(first: PosePairs, second: PosePairs) -> float:
     The difference is 0 if the scale or the noise model of a reading cannot be estimated.
     """
     _, of_first, of_second = np.intersect1d(
-        first.stamps_ns, second.stamps_ns, assume_unique=True, return_indices=True
+        first.stamps_ns,
+        second.stamps_ns,
+        assume_unique=True,
+        return_indices=True,
     )
     first = first[of_first]
     second = second[of_second]
@@ -206,7 +216,9 @@ def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
 
 
 def _unclear(
-    options: Sequence[Options], answers: Sequence[Calibration | None], difference: float
+    options: Sequence[Options],
+    answers: Sequence[Calibration | None],
+    difference: float,
 ) -> Finding:
     """Return the finding that both readings are possible, with the results of both readings."""
     texts = []

@@ -19,9 +19,15 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from hand_eye_calib.core.alignment.time_offset import TimeOffset, refine_time_offset
+from hand_eye_calib.core.alignment.time_offset import (
+    TimeOffset,
+    refine_time_offset,
+)
 from hand_eye_calib.core.base.config import METHODS, defaults_of
-from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
@@ -36,10 +42,18 @@ from hand_eye_calib.core.checks.findings import (
 from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
-from hand_eye_calib.core.engine.attempts import STREAM_REPAIRS, Attempt, with_options
+from hand_eye_calib.core.engine.attempts import (
+    STREAM_REPAIRS,
+    Attempt,
+    with_options,
+)
 from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.engine.poses import INVERSIONS
-from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.core.engine.snapshot import (
+    MOST_MOVED_S,
+    UNASKED_S,
+    Snapshot,
+)
 from hand_eye_calib.core.engine.solved_values import (
     note_on_unit,
     with_solved_offset,
@@ -93,7 +107,10 @@ class _Reading:
 
 
 def run(
-    snapshot: Snapshot, *, checks: bool | None = None, progress: Progress | None = None
+    snapshot: Snapshot,
+    *,
+    checks: bool | None = None,
+    progress: Progress | None = None,
 ) -> Attempt:
     """Calibrate: solve, check, repair, and return the best attempt.
 
@@ -190,7 +207,11 @@ def _best(
     if {*certain_options} & {*STREAM_REPAIRS}:
         verdict = first.calibration.verdict.value
         repaired = _repaired(
-            first.snapshot, first.check.findings, certain_options, settled, verdict
+            first.snapshot,
+            first.check.findings,
+            certain_options,
+            settled,
+            verdict,
         )
         best = repaired or first
     else:
@@ -208,13 +229,17 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     or the kind of data exclude a time offset, or if other mistakes must be repaired first.
     """
     config = snapshot.config
-    is_free = config.method in ("auto", "adaptive") and config.reference == "auto"
+    is_free = (
+        config.method in ("auto", "adaptive") and config.reference == "auto"
+    )
     is_settled = "time_offset" in config.given or len(snapshot.kept) > 0
     if is_settled or not is_free or not kind_of(config).has_conventions:
         return None
     if not snapshot.correlation.is_clear:
         return None
-    coarse = TimeOffset(snapshot.correlation.offset_s, correlation=snapshot.correlation)
+    coarse = TimeOffset(
+        snapshot.correlation.offset_s, correlation=snapshot.correlation
+    )
     # This precision suffices to decide whether the clocks differ.
     preliminary = refine_time_offset(
         *snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S
@@ -230,7 +255,9 @@ def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
     is_other_unit = fit.has_own_unit and scale_error >= LIMITS["scale"].error
     if is_other_unit or fit.unexplained > HOLDS:
         return None
-    offset = refine_time_offset(*snapshot.streams, preliminary, snapshot.max_gap_s)
+    offset = refine_time_offset(
+        *snapshot.streams, preliminary, snapshot.max_gap_s
+    )
     other = replace(
         snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset
     )
@@ -258,7 +285,10 @@ def _clock_is_off(first: Attempt) -> bool:
 
 
 def _reading_of(
-    snapshot: Snapshot, result: CheckResult, settled: Collection[str], known_s: float
+    snapshot: Snapshot,
+    result: CheckResult,
+    settled: Collection[str],
+    known_s: float,
 ) -> _Reading:
     """Decide whether both streams hold poses or inverse poses, if both readings fit equally well.
 
@@ -281,7 +311,9 @@ def _reading_of(
 
     choice = choosing.choose(result, pairs_of, answer_with)
     return _Reading(
-        choice.findings, choice.doubts, frozenset() if choice.is_repair else INVERSIONS
+        choice.findings,
+        choice.doubts,
+        frozenset() if choice.is_repair else INVERSIONS,
     )
 
 
@@ -303,9 +335,13 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
     """Repair streams that cannot be solved otherwise; return None if no repair is certain."""
     result = check(snapshot)
-    reading = _reading_of(snapshot, result, (), snapshot.config.given_time_offset_s)
+    reading = _reading_of(
+        snapshot, result, (), snapshot.config.given_time_offset_s
+    )
     certain_options = _certain(reading.findings, snapshot.config.given)
-    repaired = _repaired(snapshot, reading.findings, certain_options, (), "no result")
+    repaired = _repaired(
+        snapshot, reading.findings, certain_options, (), "no result"
+    )
     return repaired and repaired.with_doubts(reading.doubts)
 
 
@@ -334,7 +370,9 @@ def _repaired(
         Verdict of the streams without the repair, for the message.
     """
     options = {
-        name: value for name, value in certain_options.items() if value != "estimate"
+        name: value
+        for name, value in certain_options.items()
+        if value != "estimate"
     }
     second = _solved_with(snapshot, options) if options else None
     if not second and "time_offset" in certain_options:
@@ -351,9 +389,13 @@ def _repaired(
         second.check.findings, second.snapshot.config.given.union(settled)
     )
     further = {
-        name: value for name, value in further.items() if name not in STREAM_REPAIRS
+        name: value
+        for name, value in further.items()
+        if name not in STREAM_REPAIRS
     }
-    second = _estimated(second, further, settled, None).with_doubts(reading.doubts)
+    second = _estimated(second, further, settled, None).with_doubts(
+        reading.doubts
+    )
     if any(map(_contradicts_repair, second.check.findings)):
         return None
     verdict = second.calibration.verdict.value
@@ -376,7 +418,9 @@ def _doubts_beside_a_repair(findings: Iterable[Finding]) -> list[Finding]:
         for finding in findings
         if (finding.code, finding.stream) == ("units", "parent")
     ]
-    return doubts + [finding for finding in findings if finding.code == "ambiguous"]
+    return doubts + [
+        finding for finding in findings if finding.code == "ambiguous"
+    ]
 
 
 def _contradicts_repair(finding: Finding) -> bool:
@@ -418,9 +462,13 @@ def _estimated(
         return first
     findings = first.check.findings
     doubts = (
-        () if "parent_scale" in fixed else _unit_doubts(findings, second.calibration)
+        ()
+        if "parent_scale" in fixed
+        else _unit_doubts(findings, second.calibration)
     )
-    return _with_estimate_warnings(second, options, findings).with_doubts(doubts)
+    return _with_estimate_warnings(second, options, findings).with_doubts(
+        doubts
+    )
 
 
 def _unit_doubts(
@@ -434,7 +482,9 @@ def _unit_doubts(
     doubts = []
     for finding in findings:
         if finding.code == "unit_or_scale":
-            difference = abs(calibration.scale - 1.0 / finding.evidence["factor"])
+            difference = abs(
+                calibration.scale - 1.0 / finding.evidence["factor"]
+            )
             is_near = difference <= units.UNIT_SIGMAS * calibration.scale_sigma
             is_exact = finding.evidence["is_exact"] or is_near
             severity = Severity.ERROR if is_exact else Severity.WARNING
@@ -470,12 +520,16 @@ def _with_estimate_warnings(
     return _with_offset_doubt(attempt.with_messages(options, messages), [])
 
 
-def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt:
+def _with_offset_doubt(
+    attempt: Attempt, doubts: Collection[Finding]
+) -> Attempt:
     """Return the attempt with doubts, and with one more if the estimated time offset is large."""
     offset_s = attempt.calibration.time_offset_s
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
-        large = new_finding("large_time_offset", "child", **offset_values(offset_s))
+        large = new_finding(
+            "large_time_offset", "child", **offset_values(offset_s)
+        )
         if large not in attempt.calibration.findings:
             doubts.append(large)
     return attempt.with_doubts(doubts)
@@ -484,7 +538,9 @@ def _with_offset_doubt(attempt: Attempt, doubts: Collection[Finding]) -> Attempt
 # ------------------------------------------------------------------ one solve
 
 
-def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+def check(
+    snapshot: Snapshot, calibration: Calibration | None = None
+) -> CheckResult:
     """Check the streams of a snapshot, with their result if there is one."""
     return kind_of(snapshot.config).check(snapshot, calibration)
 
@@ -512,7 +568,9 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
         known_s = calibration.time_offset_s
     reading = _reading_of(snapshot, result, (), known_s)
     findings = gravest_first((*reading.findings, *reading.doubts))
-    estimates = {"time_offset", "scale"} & {*_certain(findings, snapshot.config.given)}
+    estimates = {"time_offset", "scale"} & {
+        *_certain(findings, snapshot.config.given)
+    }
     if not calibration or not estimates:
         return findings
     best = _best(Attempt(calibration, snapshot, result), (), None)
@@ -527,7 +585,9 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
 
 
 def with_open_errors(
-    calibration: Calibration, result: CheckResult, snapshot: Snapshot | None = None
+    calibration: Calibration,
+    result: CheckResult,
+    snapshot: Snapshot | None = None,
 ) -> Calibration:
     """Return the calibration whose allowance contains the faults that a check leaves open.
 

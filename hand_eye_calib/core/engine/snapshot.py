@@ -8,10 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.rate_correlation import Correlation, correlate_rates
-from hand_eye_calib.core.alignment.time_offset import TimeOffset, estimate_time_offset
+from hand_eye_calib.core.alignment.rate_correlation import (
+    Correlation,
+    correlate_rates,
+)
+from hand_eye_calib.core.alignment.time_offset import (
+    TimeOffset,
+    estimate_time_offset,
+)
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.base.registry import RESULT_EXAMINATIONS
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.engine.kinds import kind_of
@@ -135,7 +145,10 @@ class Snapshot:
         nameless = "a sensor without name"
         for stream in STREAMS:
             names, other = self._names(stream)
-            if names.option not in ("", names.sensor) and names.option == other.sensor:
+            if (
+                names.option not in ("", names.sensor)
+                and names.option == other.sensor
+            ):
                 raise InputError(
                     f"{stream}_frame is {names.option}, but that is the frame of the other stream: "
                     f"the parent stream is of {self.parent_names.sensor or nameless}, "
@@ -156,7 +169,9 @@ class Snapshot:
         """
         parent = _corrected(self.buffered_parent, "parent", self.config)
         child = _corrected(self.buffered_child, "child", self.config)
-        return parent, self.time_offset.steadied(child) if self.time_offset else child
+        return parent, self.time_offset.steadied(
+            child
+        ) if self.time_offset else child
 
     @cached_property
     def resolved(self) -> "Snapshot":
@@ -172,7 +187,9 @@ class Snapshot:
         """
         if not isinstance(self.config.time_offset, str):
             return self
-        offset = self.time_offset or estimated_time_offset(self.config, *self.unpaired)
+        offset = self.time_offset or estimated_time_offset(
+            self.config, *self.unpaired
+        )
         config = replace(self.config, time_offset=offset.seconds)
         return replace(self, config=config, time_offset=offset)
 
@@ -192,7 +209,9 @@ class Snapshot:
         """Longest gap (s) of :attr:`streams` in which poses are interpolated."""
         if not len(self.kept):
             return self.config.max_gap
-        return max(self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s)
+        return max(
+            self.config.max_gap, _GAP_INTERVALS * self.streams[0].interval_s
+        )
 
     @cached_property
     def pose_pairs(self) -> PosePairs:
@@ -293,7 +312,9 @@ class Snapshot:
             if len(stream) == 0:
                 return f"{needed}: no poses on the {name} stream"
         start_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
-        common_s = (min(parent.stamps_ns[-1], child.stamps_ns[-1]) - start_ns) * 1e-9
+        common_s = (
+            min(parent.stamps_ns[-1], child.stamps_ns[-1]) - start_ns
+        ) * 1e-9
         counts = f"{len(parent)} parent and {len(child)} child poses"
         if common_s < 0:
             offset_s = float(self.config.time_offset)
@@ -343,7 +364,9 @@ def _corrected(
             "rotations",
         ):
             options = f"{stream}_invert {invert}, {stream}_quaternion {order}"
-            raise ConfigError(f"{options} cannot be: the {stream} measures {kind}")
+            raise ConfigError(
+                f"{options} cannot be: the {stream} measures {kind}"
+            )
         trajectory = replace(
             trajectory, poses=se3.put_right(trajectory.poses, invert, order)
         )
@@ -381,7 +404,9 @@ def whole_snapshot(
         parent_names=names_of(
             config, "parent", parent.sensor_frame, parent.world_frame
         ),
-        child_names=names_of(config, "child", child.sensor_frame, child.world_frame),
+        child_names=names_of(
+            config, "child", child.sensor_frame, child.world_frame
+        ),
         warnings=warnings,
     )
 
@@ -391,7 +416,9 @@ def names_of(
 ) -> StreamFrames:
     """Return the names of the frames of a stream, from its messages and the options."""
     option = getattr(config, f"{stream}_frame")
-    return StreamFrames(frame_name(sensor), frame_name(world), frame_name(option))
+    return StreamFrames(
+        frame_name(sensor), frame_name(world), frame_name(option)
+    )
 
 
 def estimated_time_offset(
@@ -416,7 +443,8 @@ def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
             "kij,kij->k", rotations[candidates - 1], rotations[candidates + 1]
         )
         n_drop = min(
-            len(pose_pairs) - max_pairs + max_pairs // 10, (len(candidates) + 1) // 2
+            len(pose_pairs) - max_pairs + max_pairs // 10,
+            (len(candidates) + 1) // 2,
         )
         keep = np.ones(len(pose_pairs), dtype=bool)
         keep[candidates[np.argsort(-traces, kind="stable")[:n_drop]]] = False

@@ -11,7 +11,10 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 def with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
     """Return a finding about the scale with the scale of a result; other findings unchanged."""
-    if finding.code not in ("scale", "unit_or_scale") or not calibration.scale_sigma:
+    if (
+        finding.code not in ("scale", "unit_or_scale")
+        or not calibration.scale_sigma
+    ):
         return finding
     scale = {"scale": calibration.scale, "sigma": calibration.scale_sigma}
     return replace(finding, values={**finding.values, **scale})
@@ -27,7 +30,9 @@ def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
     values = offset_values(calibration.time_offset_s)
     values |= {"sigma_s": calibration.time_offset_sigma_s, "beyond": ""}
     options = {"time_offset": values["total_s"]}
-    return replace(finding, values={**finding.values, **values}, options=options)
+    return replace(
+        finding, values={**finding.values, **values}, options=options
+    )
 
 
 def note_on_unit(snapshot: Snapshot) -> str:

@@ -203,7 +203,9 @@ def _rigid(Ts: FloatArray, label: str = "") -> FloatArray:
     is_wrong = (differences > _ROTATION_WITHIN).any(axis=(1, 2))
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
-        raise InputError(_place(label, row) + "the 3x3 part is not a rotation matrix")
+        raise InputError(
+            _place(label, row) + "the 3x3 part is not a rotation matrix"
+        )
     is_wrong = (np.abs(Ts[:, 3] - _LAST_ROW) > LAST_ROW_WITHIN).any(axis=1)
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
@@ -234,10 +236,16 @@ def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
     vector_shapes = ((3,), (3, 1), (1, 3))
     are_rotations = rotations.shape[1:] in ((3, 3), *vector_shapes)
     are_translations = translations.shape[1:] in vector_shapes
-    return (rotations, translations) if are_rotations and are_translations else None
+    return (
+        (rotations, translations)
+        if are_rotations and are_translations
+        else None
+    )
 
 
-def _joined(rotations: FloatArray, translations: FloatArray, label: str) -> FloatArray:
+def _joined(
+    rotations: FloatArray, translations: FloatArray, label: str
+) -> FloatArray:
     """Return poses (N, 4, 4) of rotations or rotation vectors, and translations."""
     if len(rotations) != len(translations):
         raise InputError(
@@ -262,7 +270,9 @@ def _single_stack(values: Any, label: str) -> FloatArray:
         return se3.from_rotation_translation(array[:, :, :3], array[:, :, 3])
     if array is None or array.shape[1:] != (4, 4):
         shape = (
-            "rows of different shapes" if array is None else f"an array {array.shape}"
+            "rows of different shapes"
+            if array is None
+            else f"an array {array.shape}"
         )
         raise InputError(
             f"{label}: expected poses as (N, 4, 4), (N, 7) of x, y, z, qx, qy, qz, qw, or a pair "
@@ -275,7 +285,11 @@ def wrong_last_row(T: FloatArray) -> str:
     """Return a message about a matrix (4, 4) whose last row is not 0 0 0 1."""
     numbers = " ".join(f"{value:.4g}" for value in T[3])
     is_transposed = np.allclose(T[:, 3], _LAST_ROW, atol=LAST_ROW_WITHIN)
-    cause = ": the matrix is transposed, write it row by row" if is_transposed else ""
+    cause = (
+        ": the matrix is transposed, write it row by row"
+        if is_transposed
+        else ""
+    )
     return f"the last row of the matrix is {numbers}, expected 0 0 0 1{cause}"
 
 
@@ -434,7 +448,10 @@ class FrameTree:
         return edge
 
     def pose(
-        self, frame: str, of: str, moving: Mapping[str, FloatArray] | None = None
+        self,
+        frame: str,
+        of: str,
+        moving: Mapping[str, FloatArray] | None = None,
     ) -> FloatArray:
         """Return the pose (..., 4, 4) of the frame ``of`` in ``frame``.
 
@@ -495,12 +512,16 @@ class FrameTree:
         if frame not in self.edges and all(
             edge.parent != frame for edge in self.edges.values()
         ):
-            raise InputError(f"no frame {frame!r} in {self._origin}; {self.listing()}")
+            raise InputError(
+                f"no frame {frame!r} in {self._origin}; {self.listing()}"
+            )
         frames = [frame]
         while frame in self.edges:
             frame = self.edges[frame].parent
             if frame in frames:
-                raise InputError(f"{self._origin} form a loop through frame {frame!r}")
+                raise InputError(
+                    f"{self._origin} form a loop through frame {frame!r}"
+                )
             frames.append(frame)
         return frames
 

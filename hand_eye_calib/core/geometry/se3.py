@@ -133,7 +133,9 @@ def rotation_from_rpy(rpy: ArrayLike) -> FloatArray:
 def _about_axes(angles: FloatArray) -> list[FloatArray]:
     """Return rotations (..., 3, 3) about x, about y and about z by angles (..., 3), rad."""
     units = np.eye(3)
-    return [rotation_exp(angles[..., axis, None] * units[axis]) for axis in range(3)]
+    return [
+        rotation_exp(angles[..., axis, None] * units[axis]) for axis in range(3)
+    ]
 
 
 def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
@@ -244,10 +246,14 @@ def rotation_exp(rotation_vector: ArrayLike) -> FloatArray:
     divisors = np.where(is_turned, half, 1.0)
     sine_ratio = np.where(is_turned, np.sin(half) / divisors, 1.0)
     vector = (0.5 * sine_ratio)[..., None] * rotation_vector
-    return _matrices(vector[..., 0], vector[..., 1], vector[..., 2], np.cos(half))
+    return _matrices(
+        vector[..., 0], vector[..., 1], vector[..., 2], np.cos(half)
+    )
 
 
-def _matrices(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> FloatArray:
+def _matrices(
+    x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray
+) -> FloatArray:
     """Return rotation matrices (..., 3, 3) of the coefficients (...) of unit quaternions."""
     twice_x = 2.0 * x
     twice_y = 2.0 * y
@@ -271,7 +277,9 @@ def inverse(transforms: ArrayLike) -> FloatArray:
     """Return the inverses ``T_source_target`` of transforms ``T_target_source`` (..., 4, 4)."""
     transforms = np.asarray(transforms, dtype=float)
     back = np.swapaxes(rotation_of(transforms), -1, -2)
-    return from_rotation_translation(back, -times(back, translation_of(transforms)))
+    return from_rotation_translation(
+        back, -times(back, translation_of(transforms))
+    )
 
 
 def retracted(transform: FloatArray, step: FloatArray) -> FloatArray:
@@ -318,7 +326,9 @@ def exp(xi: ArrayLike) -> FloatArray:
     second = np.where(is_small, second_series, (safe - np.sin(safe)) / safe**3)
     cross_once = cross(phi, rho)
     translation = (
-        rho + first[..., None] * cross_once + second[..., None] * cross(phi, cross_once)
+        rho
+        + first[..., None] * cross_once
+        + second[..., None] * cross(phi, cross_once)
     )
     return from_rotation_translation(rotation_exp(phi), translation)
 
@@ -353,7 +363,9 @@ def log(transforms: ArrayLike) -> FloatArray:
     coefficient = np.where(is_small, series, closed)
     cross_once = cross(phi, translation)
     rho = (
-        translation - 0.5 * cross_once + coefficient[..., None] * cross(phi, cross_once)
+        translation
+        - 0.5 * cross_once
+        + coefficient[..., None] * cross(phi, cross_once)
     )
     return np.concatenate([rho, phi], axis=-1)
 
@@ -388,7 +400,9 @@ def rotation_angle(rotation: ArrayLike) -> FloatArray:
     return np.arctan2(twice_sine, twice_cosine)
 
 
-def interpolate(start: FloatArray, end: FloatArray, fraction: ArrayLike) -> FloatArray:
+def interpolate(
+    start: FloatArray, end: FloatArray, fraction: ArrayLike
+) -> FloatArray:
     """Interpolate poses along the geodesic of SE(3), which is a motion with constant twist.
 
     Parameters
@@ -501,7 +515,9 @@ def sigmas_in_parent(
     return np.sqrt(np.maximum(variances, 0.0))
 
 
-def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArray:
+def sigmas_rpy(
+    T_target_source: FloatArray, covariance: FloatArray
+) -> FloatArray:
     """Return standard deviations (3,) of roll, pitch and yaw, rad, to first order.
 
     Parameters
@@ -531,7 +547,9 @@ def sigmas_rpy(T_target_source: FloatArray, covariance: FloatArray) -> FloatArra
             [0.0, sine / np.cos(pitch), cosine / np.cos(pitch)],
         ]
     )
-    sigmas = np.sqrt(np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0))
+    sigmas = np.sqrt(
+        np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0)
+    )
     sigmas[sigmas > _MAX_SIGMA_RAD] = np.inf
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
     largest = np.max(principal[principal <= _MAX_SIGMA_RAD], initial=0.0)
@@ -572,11 +590,15 @@ def absolute_errors(
     return float(translation), float(rotation)
 
 
-def deviation(T_parent_child: FloatArray, T_reference: FloatArray) -> FloatArray:
+def deviation(
+    T_parent_child: FloatArray, T_reference: FloatArray
+) -> FloatArray:
     """Return deviations (..., 6) of transforms (..., 4, 4) from a reference (4, 4).
 
     The deviations are along (m) and about (rad) the axes of the parent sensor's frame.
     """
-    rotation = rotation_log(rotation_of(T_parent_child) @ rotation_of(T_reference).T)
+    rotation = rotation_log(
+        rotation_of(T_parent_child) @ rotation_of(T_reference).T
+    )
     translation = translation_of(T_parent_child) - translation_of(T_reference)
     return np.concatenate([translation, rotation], axis=-1)

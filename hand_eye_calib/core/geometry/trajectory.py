@@ -85,7 +85,9 @@ def scatter_of_direction(poses: FloatArray) -> float:
     if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return 1.0
     directions = steps[is_step] / lengths[is_step, None]
-    in_sensor = np.einsum("nji,nj->ni", rotations[rows[:-1][is_step]], directions)
+    in_sensor = np.einsum(
+        "nji,nj->ni", rotations[rows[:-1][is_step]], directions
+    )
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
@@ -132,7 +134,9 @@ class Columns(WithArrays):
         """Return a selection of the rows, by a slice, a mask or an array of indices."""
         columns = []
         for column in self.columns:
-            columns.append(column[index] if isinstance(column, np.ndarray) else column)
+            columns.append(
+                column[index] if isinstance(column, np.ndarray) else column
+            )
         return type(self)(*columns)
 
     @classmethod
@@ -188,9 +192,13 @@ class Trajectory(Columns):
     def __post_init__(self) -> None:
         stamps_ns = np.ascontiguousarray(self.stamps_ns)
         poses = np.ascontiguousarray(floats("poses", self.poses))
-        if stamps_ns.ndim != 1 or not np.issubdtype(stamps_ns.dtype, np.integer):
+        if stamps_ns.ndim != 1 or not np.issubdtype(
+            stamps_ns.dtype, np.integer
+        ):
             is_float = np.issubdtype(stamps_ns.dtype, np.floating)
-            hint = ": multiply seconds by 1e9 and round them" if is_float else ""
+            hint = (
+                ": multiply seconds by 1e9 and round them" if is_float else ""
+            )
             raise InputError(
                 "stamps_ns must be one-dimensional integers (nanoseconds); "
                 f"found shape {stamps_ns.shape} of {stamps_ns.dtype}{hint}"
@@ -234,7 +242,9 @@ class Trajectory(Columns):
         """
         translations = floats("translations", translations, 3)
         quats_xyzw = floats("quats_xyzw", quats_xyzw, 4)
-        _check_finite("pose", np.concatenate([translations, quats_xyzw], axis=1))
+        _check_finite(
+            "pose", np.concatenate([translations, quats_xyzw], axis=1)
+        )
         norms = np.linalg.norm(quats_xyzw, axis=1)
         wrong = np.abs(norms - 1.0) > QUATERNION_NORM_TOLERANCE
         if wrong.any():
@@ -313,7 +323,9 @@ class Trajectory(Columns):
         """Median time (s) between consecutive poses. There must be at least two poses."""
         return median(np.diff(self.stamps_ns)) * 1e-9
 
-    def shifted(self, offset_s: float, rate: float = 0.0, about_ns: int = 0) -> Self:
+    def shifted(
+        self, offset_s: float, rate: float = 0.0, about_ns: int = 0
+    ) -> Self:
         """Return the same poses with shifted stamps.
 
         Parameters
@@ -343,7 +355,9 @@ class Trajectory(Columns):
             )
         stamps_ns = self.stamps_ns + np.int64(offset_ns)
         if rate:
-            stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(np.int64)
+            stamps_ns += np.round(rate * (self.stamps_ns - about_ns)).astype(
+                np.int64
+            )
         unshifted = None if rate else self._unshifted or self
         return self._unchecked("stamps_ns", stamps_ns, unshifted)
 
@@ -362,7 +376,9 @@ class Trajectory(Columns):
     ) -> Self:
         """Return a copy with another value of a field, without checks."""
         changed = object.__new__(type(self))
-        values = {column.name: getattr(self, column.name) for column in fields(self)}
+        values = {
+            column.name: getattr(self, column.name) for column in fields(self)
+        }
         values |= {name: value, "_unshifted": unshifted}
         for key in values:
             object.__setattr__(changed, key, values[key])
@@ -406,7 +422,10 @@ class Trajectory(Columns):
         return steps, changes, shares
 
     def at(
-        self, stamps_ns: IntArray, extrapolate: bool = False, straight: bool = False
+        self,
+        stamps_ns: IntArray,
+        extrapolate: bool = False,
+        straight: bool = False,
     ) -> FloatArray:
         """Interpolate poses (M, 4, 4) at other stamps, see :func:`corner_corrections`.
 
@@ -432,13 +451,17 @@ class Trajectory(Columns):
             raise InputError(
                 f"interpolation needs at least two poses; found {len(self)}"
             )
-        is_outside = (stamps_ns < self.stamps_ns[0]) | (stamps_ns > self.stamps_ns[-1])
+        is_outside = (stamps_ns < self.stamps_ns[0]) | (
+            stamps_ns > self.stamps_ns[-1]
+        )
         if is_outside.any() and not extrapolate:
             raise InputError(
                 f"{int(is_outside.sum())} of {len(stamps_ns)} stamps lie outside the trajectory "
                 f"({self.stamps_ns[0]} to {self.stamps_ns[-1]} ns); poses are not extrapolated"
             )
-        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self) - 1)
+        after = np.clip(
+            np.searchsorted(self.stamps_ns, stamps_ns), 1, len(self) - 1
+        )
         before = after - 1
         span = (self.stamps_ns[after] - self.stamps_ns[before]).astype(float)
         fraction = (stamps_ns - self.stamps_ns[before]).astype(float) / span
@@ -475,7 +498,9 @@ class Table(Protocol):
 
 
 #: A trajectory, or an input of :func:`hand_eye_calib.read_trajectory`: a path, rows or a table.
-TrajectoryLike: TypeAlias = Trajectory | str | PathLike[str] | np.ndarray | Table
+TrajectoryLike: TypeAlias = (
+    Trajectory | str | PathLike[str] | np.ndarray | Table
+)
 
 
 def far_position(x: float, y: float, z: float) -> str:
@@ -520,7 +545,9 @@ def are_earth_centred(positions: FloatArray) -> bool:
     Such positions are probably relative to the centre of the earth (ECEF).
     """
     distances_m = np.linalg.norm(positions, axis=1)
-    return bool(((distances_m > _MIN_EARTH_M) & (distances_m < _MAX_EARTH_M)).all())
+    return bool(
+        ((distances_m > _MIN_EARTH_M) & (distances_m < _MAX_EARTH_M)).all()
+    )
 
 
 def corner_corrections(
@@ -570,7 +597,9 @@ def corner_corrections(
     return -half_square_s2[:, None] * shares[start] * bend
 
 
-def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]:
+def repetitions(
+    trajectory: Trajectory, least_s: float
+) -> list[tuple[int, int]]:
     """Return the first and last stamp (ns) of each period in which a stream repeats one pose.
 
     Parameters
@@ -586,4 +615,6 @@ def repetitions(trajectory: Trajectory, least_s: float) -> list[tuple[int, int]]
     rows = np.flatnonzero(changes)
     from_ns, until_ns = trajectory.stamps_ns[rows].reshape(-1, 2).T
     is_long = until_ns - from_ns >= least_s * 1e9
-    return [*zip(from_ns[is_long].tolist(), until_ns[is_long].tolist(), strict=True)]
+    return [
+        *zip(from_ns[is_long].tolist(), until_ns[is_long].tolist(), strict=True)
+    ]

@@ -183,7 +183,8 @@ class AdaptiveSolution(ModelSolution):
     def systematic(self) -> str:
         """Names of the significant systematic errors, joined by ``+``; ``none`` without any."""
         is_significant = (
-            np.abs(self.parameters) > MIN_REPORTED_SIGMAS * self.parameter_sigmas
+            np.abs(self.parameters)
+            > MIN_REPORTED_SIGMAS * self.parameter_sigmas
         )
         names = [
             name
@@ -221,7 +222,10 @@ class AdaptiveSolution(ModelSolution):
         taus_s = np.exp(self.levels[TIME_CONSTANTS])
         lasting = []
         for (kind, part), sigma, tau_s in zip(
-            self.model.processes, process_sigmas.tolist(), taus_s.tolist(), strict=True
+            self.model.processes,
+            process_sigmas.tolist(),
+            taus_s.tolist(),
+            strict=True,
         ):
             lasting.append(
                 CorrelatedError(kind=kind, part=part, sigma=sigma, tau_s=tau_s)
@@ -253,7 +257,9 @@ class AdaptiveSolution(ModelSolution):
             Time offset and scale that were estimated before and applied to the poses. The solution
             refines them.
         """
-        sentences = self._noise_in_words() + self._systematic_in_words(offset_s, scale)
+        sentences = self._noise_in_words() + self._systematic_in_words(
+            offset_s, scale
+        )
         sentences += self.events(stamps_ns)
         return replace(self.noise, in_words=tuple(sentences))
 
@@ -294,7 +300,9 @@ class AdaptiveSolution(ModelSolution):
         systematic = self.systematic.split("+")
         sentences = []
         if "scale" in systematic and scale is not None:
-            value = f"{scale * self.scale:.4f} +/- {scale * self.scale_sigma:.4f}"
+            value = (
+                f"{scale * self.scale:.4f} +/- {scale * self.scale_sigma:.4f}"
+            )
             sentences.append(f"the scale is {value}, refined from {scale:.4f}")
         elif "scale" in systematic:
             percent = 100 * (self.scale - 1)
@@ -314,7 +322,8 @@ class AdaptiveSolution(ModelSolution):
         if "rate" in systematic:
             rates = zip("xyz", *np.degrees(self.rate_bias), strict=True)
             about = ", ".join(
-                f"{axis} {bias:.3g} +/- {sigma:.1g}" for axis, bias, sigma in rates
+                f"{axis} {bias:.3g} +/- {sigma:.1g}"
+                for axis, bias, sigma in rates
             )
             sentences.append(
                 f"bias of the angular rates, along the child's axes: {about} deg/s"
@@ -338,11 +347,15 @@ def _process_in_words(process: CorrelatedError) -> str:
     """Return a sentence about a time-correlated error."""
     duration = f"{process.tau_s:.2g} s"
     if process.part == "scale":
-        return f"the scale drifts by {100 * process.sigma:.2g} % within {duration}"
+        return (
+            f"the scale drifts by {100 * process.sigma:.2g} % within {duration}"
+        )
     if process.part == "direction":
         return f"the direction of travel drifts by {angle(process.sigma)} within {duration}"
     size = (
-        length(process.sigma) if process.part == "translation" else angle(process.sigma)
+        length(process.sigma)
+        if process.part == "translation"
+        else angle(process.sigma)
     )
     frame = _FIXED_TO[process.kind]
     return f"errors of {size} per axis, correlated over {duration}, keep their direction in {frame}"
@@ -417,7 +430,9 @@ def _search(problem: Problem) -> AdaptiveSolution:
         kept = _strided_poses(problem, first)
         if len(kept) < len(problem.streams):
             fewer = replace(problem, streams=problem.streams[kept])
-            return _expand_to_all_poses(_search(fewer), kept, first.outliers.spikes)
+            return _expand_to_all_poses(
+                _search(fewer), kept, first.outliers.spikes
+            )
     fit = _run_stages(_LAST_STAGES, workspace, first)
     if not is_settled(workspace, fit):
         workspace = Workspace(
@@ -472,7 +487,11 @@ def _expand_to_all_poses(
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights
     return replace(
-        fewer, jumps=jumps, spikes=spikes, weights=weights, is_noise_dominated=True
+        fewer,
+        jumps=jumps,
+        spikes=spikes,
+        weights=weights,
+        is_noise_dominated=True,
     )
 
 
@@ -530,7 +549,10 @@ def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
     """Return the number of residuals that are used, less that of parameters; at least 1."""
     streams = problem.streams
     positions = np.concatenate(
-        [se3.translation_of(streams.Ts_pw_p), se3.translation_of(streams.Ts_cw_c)],
+        [
+            se3.translation_of(streams.Ts_pw_p),
+            se3.translation_of(streams.Ts_cw_c),
+        ],
         axis=1,
     )
     # Streams of rotations alone have constant positions.

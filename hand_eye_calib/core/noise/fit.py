@@ -72,7 +72,12 @@ class Problem:
     def linearised(self, fit: Fit) -> Linearisation:
         """Return the residuals at a fit and their derivatives."""
         return linearise(
-            fit.poses, fit.course, fit.T, fit.parameters, self.columns, fit.error
+            fit.poses,
+            fit.course,
+            fit.T,
+            fit.parameters,
+            self.columns,
+            fit.error,
         )
 
     def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
@@ -96,13 +101,16 @@ class Problem:
     def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
         """Return the motion of the child, smoothed as much as the noise levels (m,) require."""
         noise_m = float(np.exp(0.5 * increment_levels(levels)[0]))
-        return course_of(self.streams, T_parent_child, self.tuning.caution * noise_m**2)
+        return course_of(
+            self.streams, T_parent_child, self.tuning.caution * noise_m**2
+        )
 
     def is_noisy(self, fit: Fit) -> bool:
         """Return whether rotation noise exceeds a share of the usual rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
         return bool(
-            np.exp(0.5 * fit.levels[ROTATION]) > self.tuning.noisy_share * median(turns)
+            np.exp(0.5 * fit.levels[ROTATION])
+            > self.tuning.noisy_share * median(turns)
         )
 
 
@@ -138,12 +146,16 @@ class Workspace:
         if n_poses <= MAX_POSES:
             if self._linearisation is None:
                 self._linearisation = problem.linearised(fit)
-            return Posterior(problem.space_of(fit, self._linearisation), fit.levels)
+            return Posterior(
+                problem.space_of(fit, self._linearisation), fit.levels
+            )
 
         def space_of(poses: IntArray) -> StateSpace:
             return problem.space(fit, poses)
 
-        return PartwisePosterior(space_of, n_poses, problem.prior(fit), fit.levels)
+        return PartwisePosterior(
+            space_of, n_poses, problem.prior(fit), fit.levels
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,7 +198,9 @@ class Fit:
     weights: FloatArray
     sigmas: FloatArray
     has_heavy_tails: bool = False
-    parameters: FloatArray = field(default_factory=lambda: np.zeros(N_SYSTEMATIC))
+    parameters: FloatArray = field(
+        default_factory=lambda: np.zeros(N_SYSTEMATIC)
+    )
 
     def is_linearised_as(self, other: Fit) -> bool:
         """Return whether the residuals and derivatives are those of another fit.
@@ -194,7 +208,9 @@ class Fit:
         Fits that differ in levels or weights share these arrays.
         """
         names = ("poses", "error", "course", "T", "parameters")
-        return all(getattr(self, name) is getattr(other, name) for name in names)
+        return all(
+            getattr(self, name) is getattr(other, name) for name in names
+        )
 
     def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
         """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""
@@ -218,7 +234,9 @@ class Fit:
         parameters[columns] += step[6:]
         if np.linalg.norm(step[:3]) >= _MAX_STEP_M:
             return replace(self, parameters=parameters)
-        return replace(self, T=self.T @ se3.exp(step[:6]), parameters=parameters)
+        return replace(
+            self, T=self.T @ se3.exp(step[:6]), parameters=parameters
+        )
 
     def corrected(self, streams: Streams, states: FloatArray) -> Fit:
         """Return the fit with poses from which the smoothed errors c are removed.
@@ -238,7 +256,9 @@ class Fit:
         spikes = self.outliers.spikes
         T = self.T
         white_error = np.where(spikes[:, None], 0.0, states[:, :WHITE])
-        error = states[:, :WHITE] + self.model.process_errors(states, self.poses, T)
+        error = states[:, :WHITE] + self.model.process_errors(
+            states, self.poses, T
+        )
         other_error = error - white_error
         shares = self.model.shares(self.levels, self.poses, T)
         # Ad(X^-1) a of the parent, and b of the child, with c = Ad(X^-1) a - b.

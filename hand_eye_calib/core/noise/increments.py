@@ -191,7 +191,9 @@ def _smooth_steps(
 
 def cumulative_sum(steps: FloatArray) -> FloatArray:
     """Return the sums (N, ...) of the steps (N - 1, ...) before each instant; the first is zero."""
-    return np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
+    return np.concatenate(
+        [np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)]
+    )
 
 
 @dataclass(frozen=True)
@@ -266,7 +268,9 @@ def linearise(
     systematic = np.zeros((len(steps), 6, N_SYSTEMATIC))
     systematic[:, :, SCALE] = by_steps[:, :, 0]
     systematic[:, :3, BIAS] = R_B_transposed @ metres
-    systematic[:, :, TIME] = se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
+    systematic[:, :, TIME] = (
+        se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
+    )
     systematic[:, 3:, RATE] = by_rate
     by_xi = np.eye(6) - adjoints
     all_columns = np.concatenate(
@@ -284,7 +288,9 @@ def first_residuals(
     for start in range(0, len(streams) - 1, _BATCH):
         poses = slice(start, start + _BATCH + 1)
         parameters = np.zeros(N_SYSTEMATIC)
-        part = linearise(streams[poses], course[poses], T_parent_child, parameters, [])
+        part = linearise(
+            streams[poses], course[poses], T_parent_child, parameters, []
+        )
         residuals.append(part.residuals)
     return np.concatenate(residuals)
 
@@ -342,4 +348,6 @@ def without_rate_bias(
     by_rate = _derivatives_by_rate_bias(rotations, intervals_s)
     corrections = se3.rotation_exp(-by_rate @ bias)
     integrated = se3.chained(rotations @ corrections)
-    return se3.from_rotation_translation(integrated, np.zeros((len(integrated), 3)))
+    return se3.from_rotation_translation(
+        integrated, np.zeros((len(integrated), 3))
+    )

@@ -174,13 +174,19 @@ class NoiseModel:
                 h0.append(linearisation.adjoints @ M[:-1])
         return StateSpace(
             intervals_s=intervals_s,
-            walk_factors=np.clip(intervals_s / self.interval_s, *_WALK_FACTOR_LIMITS),
+            walk_factors=np.clip(
+                intervals_s / self.interval_s, *_WALK_FACTOR_LIMITS
+            ),
             columns=linearisation.columns,
             h1_processes=np.concatenate(h1_processes, axis=2),
-            h0=np.concatenate(h0, axis=2) if self.processes else linearisation.adjoints,
+            h0=np.concatenate(h0, axis=2)
+            if self.processes
+            else linearisation.adjoints,
             white_bases=(TRANSLATIONS[None], white_rotations, jitter),
             walk_bases=(TRANSLATIONS, rotations),
-            group_sizes=tuple(matrices.shape[2] for matrices in h1_processes[1:]),
+            group_sizes=tuple(
+                matrices.shape[2] for matrices in h1_processes[1:]
+            ),
             weights=weights,
             cut=cut,
             prior=prior,
@@ -222,9 +228,13 @@ class NoiseModel:
             S_c = S_c + 0.5 * rotation * ROTATIONS
         S_p = to_child @ S_c @ to_child.T
         if self.centre == "child":
-            S_c = S_c + rotation * self._rotations_about_origin(streams, to_child)
+            S_c = S_c + rotation * self._rotations_about_origin(
+                streams, to_child
+            )
         elif self.centre == "parent":
-            S_p = S_p + rotation * self._rotations_about_origin(streams, to_child)
+            S_p = S_p + rotation * self._rotations_about_origin(
+                streams, to_child
+            )
         return transposed(np.linalg.solve(S_p + S_c, S_p))
 
     def prior(self, levels: FloatArray) -> Prior:
@@ -246,7 +256,9 @@ class NoiseModel:
         lower[TIME_CONSTANTS] = shortest
         longest_of_direction = shortest + np.log(_MAX_INTERVALS_OF_DIRECTION)
         is_direction = [part == "direction" for _, part in self.processes]
-        upper[TIME_CONSTANTS] = np.where(is_direction, longest_of_direction, longest)
+        upper[TIME_CONSTANTS] = np.where(
+            is_direction, longest_of_direction, longest
+        )
         return Prior(mean, precision, lower, upper)
 
     @property
@@ -257,7 +269,9 @@ class NoiseModel:
         outside the bounds for a short recording.
         """
         shortest_s = self.tuning.start_tau_intervals * self.interval_s
-        longest_s = max(self.tuning.start_tau_share * self.duration_s, shortest_s)
+        longest_s = max(
+            self.tuning.start_tau_share * self.duration_s, shortest_s
+        )
         return 0.5 * float(np.log(shortest_s * longest_s))
 
     @property
@@ -322,7 +336,9 @@ def _directions(
     """Return the matrices M (N, 6, 3) from a process of kind "body" or "world" to the error c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
-    return to_child[:, PARTS[part]] @ transposed(se3.rotation_of(streams.Ts_pw_p))
+    return to_child[:, PARTS[part]] @ transposed(
+        se3.rotation_of(streams.Ts_pw_p)
+    )
 
 
 def fast_sigmas(levels: FloatArray) -> FastSigmas:

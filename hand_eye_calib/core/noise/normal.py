@@ -52,7 +52,9 @@ def gram(blocks: FloatArray) -> FloatArray:
 
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the products (k, l) of columns (n, d, k) with columns (n, d, l), summed over n, d."""
-    return first.reshape(-1, first.shape[2]).T @ second.reshape(-1, second.shape[2])
+    return first.reshape(-1, first.shape[2]).T @ second.reshape(
+        -1, second.shape[2]
+    )
 
 
 def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -135,7 +137,9 @@ class Factor:
     def __init__(self, diagonal: FloatArray, below: FloatArray) -> None:
         self._rounds: list[_Round] = []
         self.log_determinant = 0.0
-        while len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _FEW:
+        while (
+            len(diagonal) > 1 and diagonal.shape[0] * diagonal.shape[1] > _FEW
+        ):
             inverse, log_determinants = inverse_roots(diagonal[1::2])
             n_after = (len(diagonal) - 1) // 2
             before = inverse @ below[::2]
@@ -166,7 +170,9 @@ class Factor:
             eliminated = inverse @ right[1::2]
             right = right[::2].copy()
             right[: len(eliminated)] -= transposed(before) @ eliminated
-            right[1 : 1 + len(after)] -= transposed(after) @ eliminated[: len(after)]
+            right[1 : 1 + len(after)] -= (
+                transposed(after) @ eliminated[: len(after)]
+            )
             whitened[start : start + len(eliminated)] = eliminated
             start += len(eliminated)
         last = right.reshape(len(self._last), -1)
@@ -186,9 +192,13 @@ class Factor:
             neighbours = solved
             end = start
             start -= len(inverse)
-            eliminated = whitened[start:end] - before @ neighbours[: len(inverse)]
+            eliminated = (
+                whitened[start:end] - before @ neighbours[: len(inverse)]
+            )
             eliminated[: len(after)] -= after @ neighbours[1 : 1 + len(after)]
-            solved = np.empty((len(inverse) + len(neighbours), *neighbours.shape[1:]))
+            solved = np.empty(
+                (len(inverse) + len(neighbours), *neighbours.shape[1:])
+            )
             solved[::2] = neighbours
             np.matmul(transposed(inverse), eliminated, out=solved[1::2])
         return solved
@@ -217,7 +227,9 @@ class Factor:
             eliminated += with_before @ transposed(to_before)
             eliminated[:n_after] += transposed(to_after @ with_after)
             neighbours = diagonal
-            diagonal = np.empty((len(neighbours) + n_eliminated, *neighbours.shape[1:]))
+            diagonal = np.empty(
+                (len(neighbours) + n_eliminated, *neighbours.shape[1:])
+            )
             below = np.empty((len(diagonal) - 1, *neighbours.shape[1:]))
             diagonal[::2] = neighbours
             diagonal[1::2] = eliminated
@@ -226,7 +238,9 @@ class Factor:
         return diagonal, below
 
 
-def prior_products(values: FloatArray, sigmas: FloatArray, size: int) -> FloatArray:
+def prior_products(
+    values: FloatArray, sigmas: FloatArray, size: int
+) -> FloatArray:
     """Return a prior with mean zero as products that are added to ``[J e]' V^-1 [J e]``.
 
     Parameters
@@ -287,7 +301,9 @@ class NormalEquations:
         has_information = diagonal > np.finfo(float).eps * largest
         any_square = np.where(largest > 0.0, largest, 1.0)
         scale = 1.0 / np.sqrt(np.where(has_information, diagonal, any_square))
-        both_have = has_information[..., :, None] & has_information[..., None, :]
+        both_have = (
+            has_information[..., :, None] & has_information[..., None, :]
+        )
         kept = np.where(both_have, information, 0.0)
         scaled = scale[..., :, None] * kept * scale[..., None, :]
         values, vectors = np.linalg.eigh(scaled)
@@ -302,9 +318,9 @@ class NormalEquations:
         self.is_complete = self._is_observed.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
         self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
-        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(scale).sum(
-            axis=-1
-        )
+        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(
+            scale
+        ).sum(axis=-1)
         self.log_determinant += self._log_unseen_scale()
 
     def _log_unseen_scale(self) -> FloatArray:

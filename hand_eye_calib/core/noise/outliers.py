@@ -28,10 +28,18 @@ from hand_eye_calib.core.base.stats import (
     robust_weights,
 )
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise.increments import Course, Streams, first_residuals
+from hand_eye_calib.core.noise.increments import (
+    Course,
+    Streams,
+    first_residuals,
+)
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.partwise import PartwisePosterior
-from hand_eye_calib.core.noise.state_space import WHITE, Posterior, total_covariance
+from hand_eye_calib.core.noise.state_space import (
+    WHITE,
+    Posterior,
+    total_covariance,
+)
 from hand_eye_calib.core.noise.tuning import Tuning
 
 # Smallest residual (m, rad) that may be a jump. Smaller residuals are rounding.
@@ -67,7 +75,9 @@ class Outliers:
         """
         # Whether there is a jump from each kept pose to the next one.
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
-        return Outliers(jumps | (np.diff(kept) > longest_gap), self.spikes[kept])
+        return Outliers(
+            jumps | (np.diff(kept) > longest_gap), self.spikes[kept]
+        )
 
     def differs_by(self, other: Outliers) -> float:
         """Return the share of poses at which only one of both sets has a jump or a spike."""
@@ -147,7 +157,8 @@ def _chi_squares_of_part(
     of_walk = chi_squares(
         walk[:, :, 0],
         posterior.walk_covariance * space.walk_factors[:, None, None],
-        posterior.walk_covariances() + walk[:, :, 1:] @ transposed(walk[:, :, 1:]),
+        posterior.walk_covariances()
+        + walk[:, :, 1:] @ transposed(walk[:, :, 1:]),
         space.cut,
     )
     white = states[:, :WHITE]
@@ -164,7 +175,10 @@ def _chi_squares_of_part(
 
 
 def chi_squares(
-    values: FloatArray, prior: FloatArray, posterior: FloatArray, is_unused: BoolArray
+    values: FloatArray,
+    prior: FloatArray,
+    posterior: FloatArray,
+    is_unused: BoolArray,
 ) -> FloatArray:
     """Return the chi-squares (n,) of smoothed values (n, 6).
 
@@ -218,7 +232,9 @@ def detect_outliers(
     return Outliers(jumps, spikes)
 
 
-def _jump_factor(of_walk: FloatArray, threshold: float, tuning: Tuning) -> float:
+def _jump_factor(
+    of_walk: FloatArray, threshold: float, tuning: Tuning
+) -> float:
     """Return the factor of the threshold above which a chi-square of the walk is a jump.
 
     If the steps of the walk are normal, the factor is the ratio of their median chi-square to that
@@ -250,7 +266,8 @@ def bridge_outliers(
     Ts_cw_c = streams.Ts_cw_c.copy()
     outlier_poses = np.flatnonzero(spikes[1:]) + 1
     As = (
-        se3.inverse(streams.Ts_pw_p[outlier_poses - 1]) @ streams.Ts_pw_p[outlier_poses]
+        se3.inverse(streams.Ts_pw_p[outlier_poses - 1])
+        @ streams.Ts_pw_p[outlier_poses]
     )
     Bs = se3.inverse(T_parent_child) @ As @ T_parent_child
     for pose, B in zip(outlier_poses, Bs, strict=True):
@@ -265,7 +282,9 @@ def tail_weights(posterior: Posterior | PartwisePosterior) -> FloatArray:
     covariance S. The expectation is that of the smoothed v, plus a share that smoothing removes.
     This share is assumed to be in inverse proportion to the weights of the poses.
     """
-    return np.concatenate([_tail_weights_of_part(part) for part in posterior.parts()])
+    return np.concatenate(
+        [_tail_weights_of_part(part) for part in posterior.parts()]
+    )
 
 
 def _tail_weights_of_part(posterior: Posterior) -> FloatArray:
@@ -277,6 +296,8 @@ def _tail_weights_of_part(posterior: Posterior) -> FloatArray:
     weighted_squares = (weights * squares)[~is_outlier]
     # The mean square of a white error that is not smoothed is 6.
     remaining_share = min(float(np.mean(weighted_squares)) / WHITE, 1.0)
-    removed = WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)
+    removed = (
+        WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)
+    )
     expected_squares = np.where(is_outlier, 0.0, squares + removed)
     return robust_weights("student", expected_squares)

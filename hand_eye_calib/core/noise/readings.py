@@ -27,7 +27,11 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.noise import stages
 from hand_eye_calib.core.noise.fit import Fit, Problem, Workspace
-from hand_eye_calib.core.noise.increments import SYSTEMATIC, Streams, parameter_columns
+from hand_eye_calib.core.noise.increments import (
+    SYSTEMATIC,
+    Streams,
+    parameter_columns,
+)
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.outliers import Outliers, bridge_outliers
 
@@ -83,7 +87,9 @@ def loss_difference(
     return losses[1] - losses[0]
 
 
-def _smallest_loss(workspace: Workspace, start: Fit, outliers: Outliers) -> float:
+def _smallest_loss(
+    workspace: Workspace, start: Fit, outliers: Outliers
+) -> float:
     """Return the smallest loss of a reading over all centres of rotation noise.
 
     ``start`` is a fit of this reading. The search does not use the poses and increments in
@@ -108,7 +114,9 @@ def _smallest_loss(workspace: Workspace, start: Fit, outliers: Outliers) -> floa
         raise np.linalg.LinAlgError("no noise model fits these poses")
     best = min(fits, key=lambda fit: _loss(workspace, fit))
     best = stages.time_correlated(workspace, best)
-    return min(_loss(workspace, best), _loss(workspace, stages.polish(workspace, best)))
+    return min(
+        _loss(workspace, best), _loss(workspace, stages.polish(workspace, best))
+    )
 
 
 def _loss(workspace: Workspace, fit: Fit) -> float:

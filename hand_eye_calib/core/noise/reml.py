@@ -132,7 +132,10 @@ def _search_along(
 
 
 def _newton_step(
-    levels: FloatArray, gradient: FloatArray, curvature: FloatArray, prior: Prior
+    levels: FloatArray,
+    gradient: FloatArray,
+    curvature: FloatArray,
+    prior: Prior,
 ) -> FloatArray:
     """Return the Newton step of the levels (m,), damped: no level moves by more than _MAX_STEP.
 
@@ -165,15 +168,21 @@ def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """
     states, walk = posterior.smoothed()
     white_D = _white_difference(posterior, states[:, :WHITE])
-    traces = [float((white_D * basis).sum()) for basis in posterior.space.white_bases]
+    traces = [
+        float((white_D * basis).sum()) for basis in posterior.space.white_bases
+    ]
     walk_D = _walk_difference(posterior, walk)
-    traces += [float((walk_D * basis).sum()) for basis in posterior.space.walk_bases]
+    traces += [
+        float((walk_D * basis).sum()) for basis in posterior.space.walk_bases
+    ]
     variances = np.exp(posterior.levels[: len(traces)])
     gradient = [0.5 * variances * traces]
     gradient += [
         _group_gradient(posterior, group, states) for group in posterior.groups
     ]
-    information = _average_information(posterior, states[:, :, 0], walk[:, :, 0])
+    information = _average_information(
+        posterior, states[:, :, 0], walk[:, :, 0]
+    )
     return np.concatenate(gradient), information
 
 
@@ -220,7 +229,9 @@ def _group_gradient(
     for sign in (1.0, -1.0):
         for level, change in enumerate(sign * LEVEL_CHANGE * np.eye(2)):
             changed = group.changed(change)
-            trace = float(changed.diagonal @ squares + 2.0 * changed.between @ products)
+            trace = float(
+                changed.diagonal @ squares + 2.0 * changed.between @ products
+            )
             deviance = trace + n_processes * changed.log_determinant
             gradient[level] += sign * deviance / (4.0 * LEVEL_CHANGE)
     return gradient

@@ -90,7 +90,9 @@ def start(problem: Problem) -> Fit:
     """Return the first fit: X by DNLO, first jumps and outliers, rough noise levels."""
     streams = problem.streams
     tuning = problem.tuning
-    pairs = motion_pairs(streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference)
+    pairs = motion_pairs(
+        streams.Ts_pw_p, streams.Ts_cw_c, tuning.start_reference
+    )
     T = Method("dnlo").solve(pairs).T_parent_child
     course = course_of(streams, T)
     residuals = first_residuals(streams, course, T)
@@ -114,14 +116,19 @@ def start(problem: Problem) -> Fit:
     )
 
 
-def _centre_of_rotations(streams: Streams, T: FloatArray, residuals: FloatArray) -> str:
+def _centre_of_rotations(
+    streams: Streams, T: FloatArray, residuals: FloatArray
+) -> str:
     """Return the point of CENTRES at which the translations of residuals (n, 6) are smallest.
 
     White rotation errors turn about this point.
     """
     translations = residuals[:, :3]
     rotations = residuals[:, 3:]
-    poses_of_child = {"child": streams.Ts_cw_c[1:], "parent": streams.Ts_pw_p[1:] @ T}
+    poses_of_child = {
+        "child": streams.Ts_cw_c[1:],
+        "parent": streams.Ts_pw_p[1:] @ T,
+    }
     sizes = {"sensors": median(np.linalg.norm(translations, axis=1))}
     for world, poses in poses_of_child.items():
         to_origin = se3.translation_of(se3.inverse(poses))
@@ -179,22 +186,32 @@ def _detect_in_rounds(
     tuning = problem.tuning
     for _ in range(rounds):
         if problem.is_noisy(fit):
-            fit = fit.corrected(problem.streams, _expected_states(workspace, fit))
+            fit = fit.corrected(
+                problem.streams, _expected_states(workspace, fit)
+            )
         of_walk, of_white = innovation_chi_squares(
             workspace.posterior(fit), fit.outliers.spikes
         )
-        detected = detect_outliers(fit.outliers, of_walk, of_white, tuning, with_spikes)
+        detected = detect_outliers(
+            fit.outliers, of_walk, of_white, tuning, with_spikes
+        )
         change = detected.differs_by(fit.outliers)
         if change:
             poses = bridge_outliers(problem.streams, fit.T, detected.spikes)
             fit = replace(
-                fit, outliers=detected, poses=poses, error=np.zeros_like(fit.error)
+                fit,
+                outliers=detected,
+                poses=poses,
+                error=np.zeros_like(fit.error),
             )
         if change <= tuning.negligible_share:
             break
     if with_spikes:
         of_sound = of_white[~fit.outliers.spikes]
-        is_heavy = np.mean(of_sound**2) > tuning.heavy_kurtosis * np.mean(of_sound) ** 2
+        is_heavy = (
+            np.mean(of_sound**2)
+            > tuning.heavy_kurtosis * np.mean(of_sound) ** 2
+        )
         fit = replace(fit, has_heavy_tails=bool(is_heavy))
     return fit
 
@@ -298,7 +315,9 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
     tuning = problem.tuning
     posterior = workspace.posterior(fit)
     plain = _likeliest(problem, fit, posterior, [])
-    plain_information = np.linalg.pinv(plain.normal.covariance[:6, :6], hermitian=True)
+    plain_information = np.linalg.pinv(
+        plain.normal.covariance[:6, :6], hermitian=True
+    )
     best = plain
     largest_gain = 0.0
     for column in problem.columns:

@@ -101,7 +101,9 @@ class StateSpace:
     cut: BoolArray
     prior: FloatArray
 
-    def white_precision(self, levels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def white_precision(
+        self, levels: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Invert the covariances of the white errors, without the weights of poses.
 
         Returns
@@ -130,7 +132,9 @@ class StateSpace:
 
     def apply_u_transposed(self, columns: FloatArray) -> FloatArray:
         """Return the product (N, d, k) of U' with columns (n, 6, k)."""
-        states = np.empty((len(columns) + 1, self.h0.shape[2], columns.shape[2]))
+        states = np.empty(
+            (len(columns) + 1, self.h0.shape[2], columns.shape[2])
+        )
         np.matmul(-transposed(self.h0), columns, out=states[:-1])
         states[-1] = 0.0
         states[1:, :WHITE] += columns
@@ -180,7 +184,9 @@ class Markov:
         self.after = 1.0 / variances_of_q
         self.between = -phi * self.after
         self.before = phi**2 * self.after
-        self.diagonal = np.append(self.first, self.after) + np.append(self.before, 0.0)
+        self.diagonal = np.append(self.first, self.after) + np.append(
+            self.before, 0.0
+        )
         self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
 
     def changed(self, change: FloatArray) -> Markov:
@@ -200,10 +206,12 @@ class Markov:
         It equals ``-Pi^-1 (d Pi / d log tau) values``; the derivative of Pi is numerical.
         """
         change = np.array([0.0, LEVEL_CHANGE])
-        forces = self.changed(change).forces(values) - self.changed(-change).forces(
-            values
+        forces = self.changed(change).forces(values) - self.changed(
+            -change
+        ).forces(values)
+        factor = Factor(
+            self.diagonal[:, None, None], self.between[:, None, None]
         )
-        factor = Factor(self.diagonal[:, None, None], self.between[:, None, None])
         moved = factor.restore(factor.whiten(forces[:, None]))[:, 0]
         return moved / (-2.0 * LEVEL_CHANGE)
 
@@ -255,17 +263,27 @@ class Posterior:
         self.levels = levels
         n_white = len(space.white_bases)
         is_free = space.weights == 0.0
-        self.white_precision, white_log_determinants = space.white_precision(levels)
-        self._white_precisions = space.weights[:, None, None] * self.white_precision
+        self.white_precision, white_log_determinants = space.white_precision(
+            levels
+        )
+        self._white_precisions = (
+            space.weights[:, None, None] * self.white_precision
+        )
         # An identity in place of zeros keeps Pi invertible; its log determinant is zero.
         self._white_precisions[is_free] = np.eye(WHITE)
-        self.walk_covariance = total_covariance(levels[n_white:], space.walk_bases)
+        self.walk_covariance = total_covariance(
+            levels[n_white:], space.walk_bases
+        )
         self.walk_precision = np.linalg.inv(self.walk_covariance)
         self.walk_weights = np.where(space.cut, 0.0, 1.0 / space.walk_factors)
-        self._walk_precisions = self.walk_weights[:, None, None] * self.walk_precision
+        self._walk_precisions = (
+            self.walk_weights[:, None, None] * self.walk_precision
+        )
         self.groups = self._groups(n_white + len(space.walk_bases))
         self.factor = self._factorised()
-        self.log_determinant = self._log_determinant(white_log_determinants[~is_free])
+        self.log_determinant = self._log_determinant(
+            white_log_determinants[~is_free]
+        )
         weighted, self.whitened = self.forward_half(space.columns)
         products = multiplied(space.columns, weighted) - multiplied(
             self.whitened, self.whitened
@@ -283,7 +301,11 @@ class Posterior:
         for size in self.space.group_sizes:
             states = slice(state, state + size)
             groups.append(
-                Markov(states, self.levels[level : level + 2], self.space.intervals_s)
+                Markov(
+                    states,
+                    self.levels[level : level + 2],
+                    self.space.intervals_s,
+                )
             )
             state += size
             level += 2
@@ -307,10 +329,14 @@ class Posterior:
             of_pi -= size * group.log_determinant
         walk_factors = space.walk_factors[~space.cut]
         of_walk = WHITE * np.log(walk_factors).sum()
-        of_walk += len(walk_factors) * np.linalg.slogdet(self.walk_covariance)[1]
+        of_walk += (
+            len(walk_factors) * np.linalg.slogdet(self.walk_covariance)[1]
+        )
         return float(of_walk + self.factor.log_determinant - of_pi)
 
-    def _precision_blocks(self, start: int, end: int) -> tuple[FloatArray, FloatArray]:
+    def _precision_blocks(
+        self, start: int, end: int
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the contribution of m increments, from pose ``start`` to pose ``end``, to Lambda.
 
         The blocks on the diagonal are (m + 1, d, d), those below it (m, d, d). The prior precision
@@ -336,7 +362,9 @@ class Posterior:
             below[:, WHITE:] = -(transposed(h1_processes) @ W_H0)
         diagonal[:-1] += transposed(h0) @ W_H0
         np.negative(W_H0, out=W_H0)
-        diagonal[later, :WHITE, :WHITE] += self._white_precisions[start + 1 : end + 1]
+        diagonal[later, :WHITE, :WHITE] += self._white_precisions[
+            start + 1 : end + 1
+        ]
         if start == 0:
             diagonal[0, :WHITE, :WHITE] += self._white_precisions[0]
         for group in self.groups:
@@ -348,10 +376,14 @@ class Posterior:
                 diagonal[0, states, states] += group.first
         return diagonal, below
 
-    def forward_half(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def forward_half(
+        self, columns: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) of columns Z (n, 6, k)."""
         weighted = self._walk_precisions @ columns
-        return weighted, self.factor.whiten(self.space.apply_u_transposed(weighted))
+        return weighted, self.factor.whiten(
+            self.space.apply_u_transposed(weighted)
+        )
 
     def parts(self) -> Iterator[Posterior]:
         """Return the parts of a long recording; here, the whole recording is one part."""
@@ -384,9 +416,9 @@ class Posterior:
         covariances, below = self.factor.selected_inverse
         h0 = space.h0
         half = space.apply_h1(covariances[1:])
-        total = space.apply_h1(transposed(half)) + h0 @ covariances[:-1] @ transposed(
-            h0
-        )
+        total = space.apply_h1(transposed(half)) + h0 @ covariances[
+            :-1
+        ] @ transposed(h0)
         mixed = space.apply_h1(below) @ transposed(h0)
         total -= mixed
         total -= transposed(mixed)
@@ -423,7 +455,9 @@ class Posterior:
             form[np.ix_(start_and_columns, start_and_columns)] += history
             history = _eliminate(form, n_states)
             totals.append(_eliminate(history, n_states))
-        return np.diff(np.array(totals), axis=0) + self.space.prior / (len(ends) - 1)
+        return np.diff(np.array(totals), axis=0) + self.space.prior / (
+            len(ends) - 1
+        )
 
     def _form_between(self, start: int, end: int) -> FloatArray:
         """Return the quadratic form of the increments from pose ``start`` to pose ``end``.
@@ -439,7 +473,9 @@ class Posterior:
         diagonal, below = self._precision_blocks(start, end)
         weighted = self._walk_precisions[increments] @ columns
         block = replace(
-            space, h1_processes=space.h1_processes[increments], h0=space.h0[increments]
+            space,
+            h1_processes=space.h1_processes[increments],
+            h0=space.h0[increments],
         )
         forces = block.apply_u_transposed(weighted)
         coupling = below[0] if len(diagonal) == 2 else np.zeros((size, size))
@@ -467,7 +503,9 @@ def combined(columns: FloatArray, mixing: FloatArray) -> FloatArray:
     return (columns.reshape(n * size, -1) @ mixing).reshape(n, size, -1)
 
 
-def total_covariance(levels: FloatArray, bases: tuple[FloatArray, ...]) -> FloatArray:
+def total_covariance(
+    levels: FloatArray, bases: tuple[FloatArray, ...]
+) -> FloatArray:
     """Return the sum of ``exp(level) basis`` over all bases. Further levels are ignored."""
     total = np.exp(levels[0]) * bases[0]
     for level, basis in zip(levels[1:], bases[1:], strict=False):
@@ -477,5 +515,7 @@ def total_covariance(levels: FloatArray, bases: tuple[FloatArray, ...]) -> Float
 
 def _eliminate(form: FloatArray, size: int) -> FloatArray:
     """Minimise a quadratic form over its first ``size`` variables; return the rest of the form."""
-    root = np.linalg.solve(np.linalg.cholesky(form[:size, :size]), form[:size, size:])
+    root = np.linalg.solve(
+        np.linalg.cholesky(form[:size, :size]), form[:size, size:]
+    )
     return form[size:, size:] - root.T @ root

@@ -100,7 +100,16 @@ class Tuning:
     # (m/m), of a time offset (s), of a bias of rates along each axis (rad/s).
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
     # Prior standard deviations before errors are selected. Biases are usually small.
-    first_sizes: tuple[float, ...] = (0.03, 0.0026, 0.0026, 0.0026, 0.1, 1.0, 1.0, 1.0)
+    first_sizes: tuple[float, ...] = (
+        0.03,
+        0.0026,
+        0.0026,
+        0.0026,
+        0.1,
+        1.0,
+        1.0,
+        1.0,
+    )
     # Prior standard deviation of an error that is absent: in effect, the error is zero.
     absent_sigma: float = 1e-6
     # The gain of a bias is multiplied by this factor when it is compared with that of a scale. A

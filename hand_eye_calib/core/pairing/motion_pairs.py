@@ -78,11 +78,18 @@ def slower_stream(parent_stamps_ns: IntArray, child_stamps_ns: IntArray) -> str:
         return "child"
     interval_parent = median(np.diff(parent_stamps_ns))
     interval_child = median(np.diff(child_stamps_ns))
-    return "parent" if interval_parent > _MAX_EQUAL_RATIO * interval_child else "child"
+    return (
+        "parent"
+        if interval_parent > _MAX_EQUAL_RATIO * interval_child
+        else "child"
+    )
 
 
 def synchronise(
-    parent: Trajectory, child: Trajectory, max_gap_s: float, at: str | None = None
+    parent: Trajectory,
+    child: Trajectory,
+    max_gap_s: float,
+    at: str | None = None,
 ) -> PosePairs:
     """Interpolate the faster stream at the stamps of the slower stream.
 
@@ -148,7 +155,10 @@ def select_keyframes(
         Last keyframe before these pose pairs, as zero or one pose pair.
     """
     n_poses = len(pose_pairs)
-    if n_poses == 0 or max(min_translation, min_rotation, min_interval_s) == 0.0:
+    if (
+        n_poses == 0
+        or max(min_translation, min_rotation, min_interval_s) == 0.0
+    ):
         return np.arange(n_poses)
     stamps_ns = pose_pairs.stamps_ns
     poses = pose_pairs.Ts_pw_p
@@ -164,7 +174,9 @@ def select_keyframes(
     while index < n_poses:
         window = slice(index, index + _WINDOW)
         has_passed = stamps_ns[window] - last_ns >= min_interval_s * 1e9
-        has_moved = np.full(len(has_passed), max(min_translation, min_rotation) == 0.0)
+        has_moved = np.full(
+            len(has_passed), max(min_translation, min_rotation) == 0.0
+        )
         if min_translation > 0.0:
             distances_m = np.linalg.norm(
                 poses[window, :3, 3] - se3.translation_of(T_last), axis=1
@@ -232,7 +244,9 @@ class MotionPairs(Columns):
     i: IntArray
     j: IntArray
 
-    def residuals(self, T_parent_child: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def residuals(
+        self, T_parent_child: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the residuals of AX = XB at X = (R, t), a (4, 4) array.
 
         Returns
@@ -349,4 +363,6 @@ def pairs_over(
     is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
     j = np.maximum(after - is_before, i + 1)
     is_near = stamps_ns[j] - stamps_ns[i] <= (1.5 * lag_s + 0.1) * 1e9
-    return pairs_between(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[is_near], j[is_near])
+    return pairs_between(
+        pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, i[is_near], j[is_near]
+    )

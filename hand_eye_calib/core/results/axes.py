@@ -9,7 +9,11 @@ from hand_eye_calib.core.base.text import (
     axes_in_words,
     listing,
 )
-from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS, DofVerdict
+from hand_eye_calib.core.results.records import (
+    ROTATIONS,
+    TRANSLATIONS,
+    DofVerdict,
+)
 from hand_eye_calib.core.results.result import Result
 
 
@@ -44,28 +48,39 @@ def axes_within_reach(result: Result) -> list[ReachableAxis]:
             is_hidden=dof.name in hidden,
             is_known_by_hand=dof.verdict is DofVerdict.PRIOR,
         )
-        for dof, total in zip(result.observability_measured, totals, strict=True)
+        for dof, total in zip(
+            result.observability_measured, totals, strict=True
+        )
         if dof.name not in result.out_of_reach
     ]
 
 
 def target_of(axis: str, result: Result) -> float:
     """Return the target of an axis: the largest acceptable standard deviation (m or rad)."""
-    default = result.target_rotation if axis in ROTATIONS else result.target_translation
+    default = (
+        result.target_rotation
+        if axis in ROTATIONS
+        else result.target_translation
+    )
     return float(result.target_axes.get(axis, default))
 
 
-def amounts_in_words(axes: Iterable[tuple[str, float]], between: str = " ") -> str:
+def amounts_in_words(
+    axes: Iterable[tuple[str, float]], between: str = " "
+) -> str:
     """List axes with their sizes (m or rad) in words."""
     texts = [
-        f"{axes_in_words([name])}{between}{amount(name, size)}" for name, size in axes
+        f"{axes_in_words([name])}{between}{amount(name, size)}"
+        for name, size in axes
     ]
     return listing(texts)
 
 
 def targets_in_words(axes: Sequence[ReachableAxis]) -> str:
     """Return the targets of axes in words, without repetitions."""
-    return listing([*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)])
+    return listing(
+        [*dict.fromkeys(amount(axis.name, axis.target) for axis in axes)]
+    )
 
 
 def what_is_known(result: Result) -> str:

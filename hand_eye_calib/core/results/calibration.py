@@ -15,7 +15,10 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.text import AXIS_UNITS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import inverse_covariance, sigmas_in_parent
+from hand_eye_calib.core.geometry.se3 import (
+    inverse_covariance,
+    sigmas_in_parent,
+)
 from hand_eye_calib.core.results import document, stored
 from hand_eye_calib.core.results.parts import part
 from hand_eye_calib.core.results.reasons import Verdict
@@ -30,7 +33,13 @@ from hand_eye_calib.core.results.verdict import Judged
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Calibration", "DofObservability", "DofVerdict", "SolveStatus", "Verdict"]
+__all__ = [
+    "Calibration",
+    "DofObservability",
+    "DofVerdict",
+    "SolveStatus",
+    "Verdict",
+]
 
 
 def data_frame(rows: Sequence[Mapping[str, Any]], index: str) -> "pd.DataFrame":
@@ -76,7 +85,9 @@ class Calibration(Judged):
         numbers = document.printed_numbers(
             document.transforms_of(self)["T_parent_child"], self.out_of_reach
         )
-        values = ", ".join(f"{axis} {number}" for axis, number in numbers.items())
+        values = ", ".join(
+            f"{axis} {number}" for axis, number in numbers.items()
+        )
         return (
             f"<Calibration: {self.headline}\n {frames}: {values}, "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
@@ -96,7 +107,9 @@ class Calibration(Judged):
         sigmas = self.sigmas_printed
         # Near gimbal lock, a known angle has no standard deviation.
         is_known = np.isfinite(self.sigmas)
-        values = np.where(is_known, se3.xyz_rpy(self.T_parent_child), np.nan).tolist()
+        values = np.where(
+            is_known, se3.xyz_rpy(self.T_parent_child), np.nan
+        ).tolist()
         rows = zip(self.observability, values, sigmas, strict=True)
         table = []
         for dof, value, sigma in rows:
@@ -117,26 +130,35 @@ class Calibration(Judged):
         """
         T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
-        sigmas = sigmas_in_parent(se3.rotation_of(self.T_child_parent), covariance)
+        sigmas = sigmas_in_parent(
+            se3.rotation_of(self.T_child_parent), covariance
+        )
         if self.unobservable():
             sigmas[sigmas > document.UNKNOWN_M] = np.inf
         observability = []
         for axis, sigma in zip(AXES, sigmas.tolist(), strict=True):
             is_known = math.isfinite(sigma)
-            verdict = DofVerdict.OBSERVED if is_known else DofVerdict.UNOBSERVABLE
+            verdict = (
+                DofVerdict.OBSERVED if is_known else DofVerdict.UNOBSERVABLE
+            )
             observability.append(DofObservability(axis, verdict, sigma))
         return replace(
             self,
             T_parent_child=self.T_child_parent,
-            T_method=None if self.T_method is None else se3.inverse(self.T_method),
+            T_method=None
+            if self.T_method is None
+            else se3.inverse(self.T_method),
             T_base_parent=None,
             covariance_measured=covariance,
-            covariance_allowance=inverse_covariance(T, self.covariance_allowance),
+            covariance_allowance=inverse_covariance(
+                T, self.covariance_allowance
+            ),
             observability_measured=tuple(observability),
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
             parts={
-                name: part(name).invert(value) for name, value in self.parts.items()
+                name: part(name).invert(value)
+                for name, value in self.parts.items()
             },
             time_offset_s=0.0 - self.time_offset_s,
             scale=1.0 / self.scale,

@@ -101,7 +101,12 @@ def document_of(result: Judged) -> Document:
         of = "T_parent_child as the method solved it: nothing set, no prior added"
         document["T_method"] = {"of": of, "matrix": result.T_method}
     document["findings"] = [finding.to_dict() for finding in result.findings]
-    others = {*TRANSFORMS, *COVARIANCES, *NOT_IN_FILES, "observability_measured"}
+    others = {
+        *TRANSFORMS,
+        *COVARIANCES,
+        *NOT_IN_FILES,
+        "observability_measured",
+    }
     for field in fields(result):
         if field.name not in others.union(document):
             document[field.name] = getattr(result, field.name)
@@ -123,10 +128,15 @@ def _covariances_of(result: Result) -> Document:
     child = result.child_frame
     order = ["rho_x", "rho_y", "rho_z", "phi_x", "phi_y", "phi_z"]
     measured = f"{of}: the part that the recording shows"
-    allowance = f"{of}: the allowance for constant errors, which no recording shows"
+    allowance = (
+        f"{of}: the allowance for constant errors, which no recording shows"
+    )
     return {
-        "covariance": matrix_of(of, child, result.covariance) | {"order": order},
-        "covariance_measured": matrix_of(measured, child, result.covariance_measured),
+        "covariance": matrix_of(of, child, result.covariance)
+        | {"order": order},
+        "covariance_measured": matrix_of(
+            measured, child, result.covariance_measured
+        ),
         "covariance_allowance": matrix_of(
             allowance, child, result.covariance_allowance
         ),
@@ -137,7 +147,10 @@ def _observability_of(result: Result) -> list[Document]:
     """Return a row for each axis: its standard deviation, and the two parts of it."""
     rows = []
     columns = zip(
-        result.observability, result.sigmas_measured, result.allowance, strict=True
+        result.observability,
+        result.sigmas_measured,
+        result.allowance,
+        strict=True,
     )
     for dof, measured, allowance in columns:
         row = plain(dof) | {"sigma_measured": measured, "allowance": allowance}
@@ -198,7 +211,8 @@ def transforms_of(result: Result) -> dict[str, Notation]:
         )
     hidden = {*result.unobservable()}
     return {
-        name: _notation(transform, hidden) for name, transform in transforms.items()
+        name: _notation(transform, hidden)
+        for name, transform in transforms.items()
     }
 
 
@@ -218,8 +232,12 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
     is_known = np.isfinite(sigmas) | is_rotation_known
     return Notation(
         maps=f"coordinates of {transform.source} into {transform.target}",
-        translation=np.where(np.isfinite(sigmas_m), se3.translation_of(T), np.nan),
-        sigma_translation=np.hypot(sigmas_m, sigmas_in_parent(R, allowance)[:3]),
+        translation=np.where(
+            np.isfinite(sigmas_m), se3.translation_of(T), np.nan
+        ),
+        sigma_translation=np.hypot(
+            sigmas_m, sigmas_in_parent(R, allowance)[:3]
+        ),
         sigma_measured_translation=sigmas_m,
         quat_xyzw=se3.to_quat_xyzw(T) if is_rotation_known else None,
         rpy_deg=np.degrees(np.where(is_known, se3.rotation_to_rpy(R), np.nan)),
@@ -227,7 +245,8 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
         sigma_measured_rpy_deg=np.degrees(sigmas),
         sigma_about_deg=np.degrees(
             np.hypot(
-                sigmas_in_parent(R, measured)[3:], sigmas_in_parent(R, allowance)[3:]
+                sigmas_in_parent(R, measured)[3:],
+                sigmas_in_parent(R, allowance)[3:],
             )
         ),
         matrix=T,
@@ -269,7 +288,9 @@ def summary(result: Result) -> dict[str, str]:
         "Poses": f"{result.n_poses:,}",
         **_inliers_in_words(result),
         "Objective": f"{result.objective:.6g}",
-        "Time offset": given_or_estimated(offset, result.time_offset_sigma_s, "s"),
+        "Time offset": given_or_estimated(
+            offset, result.time_offset_sigma_s, "s"
+        ),
         "Scale": given_or_estimated(result.scale, result.scale_sigma, ""),
     }
     if result.proved_global in proof:
@@ -283,7 +304,8 @@ def summary(result: Result) -> dict[str, str]:
     if result.noise:
         # Documents begin the first sentence with the name of this row.
         sentences = [
-            text.removeprefix("Noise: ").rstrip(".") for text in result.noise.in_words
+            text.removeprefix("Noise: ").rstrip(".")
+            for text in result.noise.in_words
         ]
         rows["Noise"] = "; ".join(sentences)
     return rows
@@ -313,9 +335,9 @@ def printed_numbers(
             elif not np.isfinite(sigma):  # near gimbal lock
                 texts[axis] = f"{fixed(value, 2)} {unit}"
             else:
-                number = with_sigma(value, sigma, 3 if unit == "m" else 2).replace(
-                    "+/-", sign
-                )
+                number = with_sigma(
+                    value, sigma, 3 if unit == "m" else 2
+                ).replace("+/-", sign)
                 texts[axis] = f"{number} {unit}"
     return texts
 
@@ -326,7 +348,9 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
     An example is "4 mm measured, 8 mm allowance". Axes with a negligible allowance and unknown axes
     are left out.
     """
-    sigmas = np.r_[transform.sigma_translation, np.radians(transform.sigma_rpy_deg)]
+    sigmas = np.r_[
+        transform.sigma_translation, np.radians(transform.sigma_rpy_deg)
+    ]
     measured = np.r_[
         transform.sigma_measured_translation,
         np.radians(transform.sigma_measured_rpy_deg),
@@ -340,7 +364,9 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
         allowance = math.sqrt(max(sigma**2 - sigma_measured**2, 0.0))
         if allowance > _NEGLIGIBLE_SHARE * sigma:
             recorded = amount(axis, sigma_measured)
-            parts[axis] = f"{recorded} measured, {amount(axis, allowance)} allowance"
+            parts[axis] = (
+                f"{recorded} measured, {amount(axis, allowance)} allowance"
+            )
     return parts
 
 
@@ -379,14 +405,17 @@ def _about_axes_in_words(transform: Notation, are_known: BoolArray) -> str:
     """
     about_deg = np.asarray(transform.sigma_about_deg)
     are_known = are_known & np.isfinite(about_deg)
-    ratios = np.asarray(transform.sigma_rpy_deg)[are_known] / about_deg[are_known]
+    ratios = (
+        np.asarray(transform.sigma_rpy_deg)[are_known] / about_deg[are_known]
+    )
     if not len(ratios) or not np.isfinite(ratios).all():
         return ""
     if np.abs(np.log(ratios)).max() < _SAME_ANGLES:
         return ""
     axes = np.array(TRANSLATIONS)[are_known].tolist()
     sizes = [
-        amount("roll", math.radians(sigma)) for sigma in about_deg[are_known].tolist()
+        amount("roll", math.radians(sigma))
+        for sigma in about_deg[are_known].tolist()
     ]
     word = "axes" if len(axes) > 1 else "axis"
     return (
@@ -476,5 +505,7 @@ def usable_angles(result: Result) -> dict[str, float | str]:
     angles = se3.rotation_to_rpy(se3.rotation_of(T)).tolist()
     return {
         name: angle if is_known else by_hand(name)
-        for name, angle, is_known in zip(ROTATIONS, angles, are_known, strict=True)
+        for name, angle, is_known in zip(
+            ROTATIONS, angles, are_known, strict=True
+        )
     }

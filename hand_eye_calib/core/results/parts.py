@@ -108,7 +108,9 @@ class Part:
 
 def advice_of(result: Any) -> list[str]:
     """Return what to record next, by the parts of a result that have advice."""
-    advice = [part(name).advice(value, result) for name, value in result.parts.items()]
+    advice = [
+        part(name).advice(value, result) for name, value in result.parts.items()
+    ]
     return [text for text in advice if text]
 
 

@@ -202,7 +202,10 @@ class Finding:
 
     def advice_on(self, interface: Interface) -> str:
         """Return the advice with its options, in the spelling of an interface."""
-        if self.severity is Severity.NOTE and self.code not in _NOTES_WITH_ADVICE:
+        if (
+            self.severity is Severity.NOTE
+            and self.code not in _NOTES_WITH_ADVICE
+        ):
             return NO_ACTION
         return with_options(self.advice, self.options, interface)
 
@@ -249,7 +252,9 @@ class Finding:
             if finding._has_templates():
                 return finding
         # Store the sentences among the values, with templates that only repeat them.
-        values: Document = from_plain(dict[str, float], data.get("evidence", {}))
+        values: Document = from_plain(
+            dict[str, float], data.get("evidence", {})
+        )
         sentences = {"cause": "", **data}
         for name in ("what", "advice", "cause"):
             values[name] = from_plain(str, sentences[name])
@@ -269,7 +274,9 @@ class Finding:
     def _filled(self, template: str) -> str:
         """Fill a template with the values of the finding."""
         whose = (
-            "both streams'" if self.stream == "both" else f"the {self.stream} stream's"
+            "both streams'"
+            if self.stream == "both"
+            else f"the {self.stream} stream's"
         )
         return template.format(stream=self.stream, whose=whose, **self.values)
 
@@ -301,7 +308,9 @@ def has_error(findings: Iterable[Finding]) -> bool:
 def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Sort findings by severity, errors first; findings of one severity keep their order."""
     order = list(Severity)
-    return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
+    return tuple(
+        sorted(findings, key=lambda finding: -order.index(finding.severity))
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -140,7 +140,9 @@ class Result:
     scale_sigma: float = 0.0
 
     covariance_measured: FloatArray
-    covariance_allowance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    covariance_allowance: FloatArray = field(
+        default_factory=lambda: np.zeros((6, 6))
+    )
     observability_measured: tuple[records.DofObservability, ...]
     contradictions: Mapping[str, float] = field(default_factory=dict)
 
@@ -328,7 +330,11 @@ class Result:
     @property
     def hidden(self) -> list[str]:
         """Names of the axes that these streams could determine, but this recording does not."""
-        return [axis for axis in self.unobservable() if axis not in self.out_of_reach]
+        return [
+            axis
+            for axis in self.unobservable()
+            if axis not in self.out_of_reach
+        ]
 
     @property
     def out_of_reach(self) -> tuple[str, ...]:

@@ -87,7 +87,9 @@ _CONTRADICTION_TEXTS = {
 
 def _not_converged(result: Result) -> Iterator[Ground]:
     # If an error finding explains why there is no solution, this rule adds nothing.
-    if result.status is SolveStatus.NOT_CONVERGED and not has_error(result.findings):
+    if result.status is SolveStatus.NOT_CONVERGED and not has_error(
+        result.findings
+    ):
         yield Ground("the solver did not converge", "record more varied motion")
 
 
@@ -122,16 +124,16 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
     elif result.reference == "stops" and result.hidden:
         # Rotations about one axis also hide mistakes in the conventions of stops: of 44 mistakes of
         # two simulated arms, 16 gave a wrong pose without another finding.
-        has_one_axis = any(finding.code == "one_axis" for finding in result.findings)
+        has_one_axis = any(
+            finding.code == "one_axis" for finding in result.findings
+        )
         why = (
             "do not turn about two axes"
             if has_one_axis
             else "turn too little for their errors"
         )
         ground = _hidden_ground(result, f"these stops, which {why}")
-        advice = (
-            f"turn the hand about at least two axes between them, or {ground.advice}"
-        )
+        advice = f"turn the hand about at least two axes between them, or {ground.advice}"
         yield ground._replace(advice=advice)
 
 
@@ -169,7 +171,9 @@ def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
         )
 
 
-def _scatter_of(kind: str, row: AxisScatter, axis: ReachableAxis) -> tuple[float, bool]:
+def _scatter_of(
+    kind: str, row: AxisScatter, axis: ReachableAxis
+) -> tuple[float, bool]:
     """Return the scatter of other estimates on an axis, and whether it is too large."""
     if kind == "halves":
         scatter = row.of_halves
@@ -185,7 +189,9 @@ def _scatter_of(kind: str, row: AxisScatter, axis: ReachableAxis) -> tuple[float
     if scatter is None:
         return 0.0, False
     of_target = scatter / axis.target
-    is_far = (excess or 0.0) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
+    is_far = (
+        excess or 0.0
+    ) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
     if (over_own or 0.0) > CONTRADICTED_SIGMAS:
         is_far |= of_target > CONTRADICTED_TARGETS
     return scatter, is_far
@@ -204,7 +210,9 @@ def _unconfirmed(result: Result) -> Iterator[Ground]:
         names = tuple(name for name, _ in axes)
         sizes = amounts_in_words(axes, " to ")
         text = f"only the noise model determines {sizes}; no other method does"
-        advice = f"compare {axes_in_words(names)} with a drawing or a tape measure"
+        advice = (
+            f"compare {axes_in_words(names)} with a drawing or a tape measure"
+        )
         yield Ground(text, advice, names)
 
 
@@ -219,7 +227,9 @@ def _hidden_ground(result: Result, source: str) -> Ground:
 
     ``source`` names what does not determine them, such as "this motion".
     """
-    axes = tuple(axis.name for axis in axes_within_reach(result) if axis.is_hidden)
+    axes = tuple(
+        axis.name for axis in axes_within_reach(result) if axis.is_hidden
+    )
     advice = "measure it by hand and give a prior"
     if len(axes) > 1:
         advice = "measure them by hand and give priors"
@@ -240,9 +250,7 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
         if result.reference == "windows":
             # The outliers of a vehicle are slips.
             text = f"the wheels or the vehicle slip {1 - share:.0%} of the time"
-            advice = (
-                "drive more slowly in curves, on a floor with grip, and record again"
-            )
+            advice = "drive more slowly in curves, on a floor with grip, and record again"
         yield Ground(text, advice)
 
 
@@ -270,16 +278,26 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
         return
     names = tuple(axis.name for axis in rough)
     sizes = [
-        f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}" for axis in rough
+        f"{axes_in_words([axis.name])} {axis.sigma_beside_target()}"
+        for axis in rough
     ]
     targets = targets_in_words(rough)
-    sentence = f"standard deviations above the target of {targets}: {listing(sizes)}"
-    allowances = [(axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough]
+    sentence = (
+        f"standard deviations above the target of {targets}: {listing(sizes)}"
+    )
+    allowances = [
+        (axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough
+    ]
     # The target cannot be reached if the allowance alone is above it. A longer recording still
     # helps if the allowance is less than half of the rest.
-    hopeless = [(axis.name, size) for axis, size in allowances if size > axis.target]
+    hopeless = [
+        (axis.name, size) for axis, size in allowances if size > axis.target
+    ]
     advice = []
-    if any(size <= axis.target or 2.0 * size < axis.sigma for axis, size in allowances):
+    if any(
+        size <= axis.target or 2.0 * size < axis.sigma
+        for axis, size in allowances
+    ):
         are_stops = result.reference == "stops"
         more = (
             "more stops, with larger rotations"
@@ -288,7 +306,9 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
         )
         advice.append(f"record {more}")
     if hopeless:
-        alone = f"constant odometry errors alone leave {amounts_in_words(hopeless)}"
+        alone = (
+            f"constant odometry errors alone leave {amounts_in_words(hopeless)}"
+        )
         advice.append(f"{alone}: {_FLOOR_ADVICE}")
     yield Ground(sentence, "; ".join(advice), names)
 
@@ -303,7 +323,9 @@ def _floor(result: Result) -> Iterator[Ground]:
     if not above:
         return
     names = tuple(axis.name for axis in above)
-    sizes = [f"{axes_in_words(names[:1])} is good to {above[0].sigma_beside_target()}"]
+    sizes = [
+        f"{axes_in_words(names[:1])} is good to {above[0].sigma_beside_target()}"
+    ]
     sizes += [
         f"{axes_in_words([axis.name])} to {axis.sigma_beside_target()}"
         for axis in above[1:]
@@ -311,7 +333,9 @@ def _floor(result: Result) -> Iterator[Ground]:
     is_one = len({amount(axis.name, axis.target) for axis in above}) == 1
     target_is = "the target is" if is_one else "the targets are"
     share = (
-        "Most" if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above) else "Part"
+        "Most"
+        if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above)
+        else "Part"
     )
     errors = (
         "constant errors"
@@ -360,7 +384,10 @@ _OWN_RULES = (
         _nothing_known,
     ),
     Rule(
-        "unobservable", _CARE, "an axis cannot be determined from the motion", _hidden
+        "unobservable",
+        _CARE,
+        "an axis cannot be determined from the motion",
+        _hidden,
     ),
     Rule(
         "warning_finding",

@@ -77,7 +77,9 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
     document = dict(data)
     if data["version"] == 1:
         document |= {
-            name: data[old] for name, old in _OLD_COVARIANCES.items() if old in data
+            name: data[old]
+            for name, old in _OLD_COVARIANCES.items()
+            if old in data
         }
         document["observability_measured"] = data["observability"]
         return document
@@ -105,11 +107,15 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
     readers = dict.fromkeys((*TRANSFORMS, "T_base_child"), transform_of)
     readers |= dict.fromkeys(COVARIANCES, covariance_of)
-    arrays = {name: read(data[name]) for name, read in readers.items() if name in data}
+    arrays = {
+        name: read(data[name]) for name, read in readers.items() if name in data
+    }
     if "T_base_child" in arrays:
         T_child_parent = se3.inverse(arrays["T_parent_child"])
         arrays["T_base_parent"] = arrays["T_base_child"] @ T_child_parent
-    values = {name: value for name, value in data.items() if name not in _READ_APART}
+    values = {
+        name: value for name, value in data.items() if name not in _READ_APART
+    }
     parts = {extra.name: extra.read(data) for extra in all_parts()}
     parts = {name: value for name, value in parts.items() if value is not None}
     result: _OfResult = from_plain(of, values | arrays, Comparison=Comparison)
@@ -145,7 +151,9 @@ def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
     """Raise ValueError unless each standard deviation is the root sum of squares of its parts."""
     sigmas = [from_plain(float, row["sigma"]) for row in rows]
     if not np.allclose(sigmas, result.sigmas, rtol=1e-6, atol=1e-300):
-        raise ValueError("sigma is not that of sigma_measured and the allowance")
+        raise ValueError(
+            "sigma is not that of sigma_measured and the allowance"
+        )
 
 
 def _with_allowance(result: Result) -> CrossCheck:
@@ -173,7 +181,9 @@ def covariance_of(data: Mapping[str, Any]) -> FloatArray:
     # A correlation of 1 may be a little larger due to rounding.
     bounds = (1 + 1e-6) * np.outer(sigmas, sigmas) + 1e-300
     is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
-    if not (is_symmetric and np.all(np.abs(matrix[is_known]) <= bounds[is_known])):
+    if not (
+        is_symmetric and np.all(np.abs(matrix[is_known]) <= bounds[is_known])
+    ):
         raise ValueError("a matrix is not a covariance")
     return matrix
 

@@ -53,7 +53,10 @@ class Judged(Result):
     @property
     def has_failed(self) -> bool:
         """Whether the solve failed without a finding that explains the failure."""
-        return bool(self.reasons) and self.reasons[0].rule in ("prior", "not_converged")
+        return bool(self.reasons) and self.reasons[0].rule in (
+            "prior",
+            "not_converged",
+        )
 
     @property
     def headline(self) -> str:
@@ -75,7 +78,9 @@ class Judged(Result):
             if self.out_of_reach:
                 # Axes out of reach are not among the hidden axes, and are not known either.
                 axes = axes_within_reach(self)
-                known = listing([axis.name for axis in axes if not axis.is_hidden])
+                known = listing(
+                    [axis.name for axis in axes if not axis.is_hidden]
+                )
                 text = f"{known} only; measure {them} by hand"
             if others:
                 text += f"; {others[0].sentence}"
@@ -102,8 +107,12 @@ class Judged(Result):
 
     def _notes(self) -> list[str]:
         """Notes for the headline: those of parts, and of findings that do not lower the verdict."""
-        notes = [part(name).headline(value) for name, value in self.parts.items()]
-        notes += [finding.what for finding in self.findings if _is_notable(finding)]
+        notes = [
+            part(name).headline(value) for name, value in self.parts.items()
+        ]
+        notes += [
+            finding.what for finding in self.findings if _is_notable(finding)
+        ]
         return [note for note in notes if note]
 
 
@@ -123,4 +132,6 @@ def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
 
     The other reasons may be consequences of the printed ones.
     """
-    return tuple(reason for reason in reasons if reason.verdict is reasons[0].verdict)
+    return tuple(
+        reason for reason in reasons if reason.verdict is reasons[0].verdict
+    )

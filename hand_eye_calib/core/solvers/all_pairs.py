@@ -66,7 +66,9 @@ def solve_park(pairs: MotionPairs) -> Solution:
     """
     R = align_rotation_vectors(pairs)
     rows, targets = translation_equations(pairs, R)
-    t = np.linalg.lstsq(rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE)[0]
+    t = np.linalg.lstsq(
+        rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE
+    )[0]
     T_parent_child = se3.from_rotation_translation(R, t)
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
@@ -152,7 +154,9 @@ def residual_rows(pairs: MotionPairs) -> FloatArray:
     return rows.reshape(-1, quadratic_form.DIMENSION)
 
 
-def _lowest_minimum(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool]:
+def _lowest_minimum(
+    Q: FloatArray, pairs: MotionPairs
+) -> tuple[FloatArray, bool]:
     """Return X (4, 4) at the lowest minimum of a form (13, 13), and whether it converged.
 
     The starts are those of :func:`start_rotations`.
@@ -164,7 +168,9 @@ def _lowest_minimum(Q: FloatArray, pairs: MotionPairs) -> tuple[FloatArray, bool
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
     """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than from condensed forms."""
-    return quadratic_form.costs(quadratic_form.coefficients(pairs), T_parent_child)
+    return quadratic_form.costs(
+        quadratic_form.coefficients(pairs), T_parent_child
+    )
 
 
 def start_rotations(pairs: MotionPairs) -> FloatArray:

@@ -59,7 +59,9 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     scale = max(float(np.trace(M)) / len(M), np.finfo(float).tiny)
     minimum = max(float(values[0]), 0.0)
     tolerance = _MAX_RELATIVE_GAP * minimum / scale + _ROUNDING
-    eigenvalue = _maximise_smallest_eigenvalue(M / scale, enough=-0.25 * tolerance)
+    eigenvalue = _maximise_smallest_eigenvalue(
+        M / scale, enough=-0.25 * tolerance
+    )
     # |x|^2 is 4 for every rotation. So the lower bound is below the minimum by at most 4 times a
     # negative eigenvalue.
     gap = 4.0 * max(-eigenvalue, 0.0)
@@ -77,10 +79,14 @@ def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
     """
     tables = _tables()
     across = tables.across
-    Z = M - np.tensordot(tables.stationary @ (M @ tables.identity), tables.equations, 1)
+    Z = M - np.tensordot(
+        tables.stationary @ (M @ tables.identity), tables.equations, 1
+    )
     Z_across = across.T @ Z @ across
     # The unknowns are the free multipliers and t. The first t makes Z + t I positive definite.
-    derivatives = np.concatenate([across.T @ tables.free @ across, np.eye(9)[None]])
+    derivatives = np.concatenate(
+        [across.T @ tables.free @ across, np.eye(9)[None]]
+    )
     t_start = max(-float(np.linalg.eigvalsh(Z_across)[0]), 0.0) + 0.1
     unknowns = np.append(np.zeros(len(tables.free)), t_start)
     weight = _WEIGHT_GROWTH**2
@@ -93,7 +99,9 @@ def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
         )
         step, decrement = _newton_step(solved, weight)
         unknowns = unknowns + step
-        lowest = np.linalg.eigvalsh(Z + np.tensordot(unknowns[:-1], tables.free, 1))[0]
+        lowest = np.linalg.eigvalsh(
+            Z + np.tensordot(unknowns[:-1], tables.free, 1)
+        )[0]
         best = max(best, float(lowest))
         if decrement < 0.5:
             if len(Z_across) / weight < _CLOSE:
@@ -167,7 +175,9 @@ def _tables() -> _Tables:
     identity = np.append(np.eye(3).ravel(), 1.0)
     across = np.linalg.svd(identity[None])[2][1:].T
     at_identity = (equations @ identity).T
-    null_space = np.linalg.svd(at_identity)[2][np.linalg.matrix_rank(at_identity) :]
+    null_space = np.linalg.svd(at_identity)[2][
+        np.linalg.matrix_rank(at_identity) :
+    ]
     return _Tables(
         identity=identity,
         across=across,

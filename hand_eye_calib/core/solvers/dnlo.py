@@ -75,7 +75,9 @@ _TOLERANCE = 1e-9
 _COST_OF_LEFT_OUT = 1e100
 
 
-def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> Solution:
+def solve(
+    pairs: MotionPairs, threshold: float, min_inlier_fraction: float
+) -> Solution:
     """Minimise eq. (5) over X and the weights alpha.
 
     Parameters
@@ -94,9 +96,13 @@ def solve(pairs: MotionPairs, threshold: float, min_inlier_fraction: float) -> S
     """
     searched = pairs
     if len(pairs) > _MAX_SEARCHED:
-        searched = pairs[np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)]
+        searched = pairs[
+            np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)
+        ]
     floor = min_inlier_fraction * len(searched)
-    T = _Search(quadratic_form.condense(searched), threshold, floor).best(searched)
+    T = _Search(quadratic_form.condense(searched), threshold, floor).best(
+        searched
+    )
     return _refined(pairs, T, threshold, min_inlier_fraction * len(pairs))
 
 
@@ -117,7 +123,9 @@ def _refined(
     for _ in range(_MAX_ROUNDS):
         T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
         # If the form predicts no decrease, the costs of the pairs need not be computed.
-        converged = bool(quadratic_form.decrease(Q, T, T_new) < _TOLERANCE * objective)
+        converged = bool(
+            quadratic_form.decrease(Q, T, T_new) < _TOLERANCE * objective
+        )
         if converged:
             break
         costs = quadratic_form.costs(coefficients, T_new)
@@ -203,10 +211,13 @@ def truncate(
         if excess.any():
             is_tied = costs == largest
             weights -= (
-                is_tied * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
+                is_tied
+                * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
             )
     n_outliers = costs.shape[-1] - weights.sum(axis=-1)
-    return weights, np.einsum("...k,...k", weights, costs) + threshold * n_outliers
+    return weights, np.einsum(
+        "...k,...k", weights, costs
+    ) + threshold * n_outliers
 
 
 @dataclass(frozen=True)
@@ -226,7 +237,9 @@ class _Search:
     threshold: float
     floor: float
 
-    def costs(self, Ts: FloatArray, left_out: BoolArray | None = None) -> FloatArray:
+    def costs(
+        self, Ts: FloatArray, left_out: BoolArray | None = None
+    ) -> FloatArray:
         """Return the costs (S, K) of all pairs at each transform (S, 4, 4).
 
         Pairs in ``left_out`` (S, K) have a very large cost.
@@ -251,7 +264,9 @@ class _Search:
             all_pairs.start_rotations(pairs), np.zeros(3)
         )
         for _ in range(_STEPS_OVER_ALL):
-            Ts = quadratic_form.gauss_newton_step(quadratic_form.expand(total), Ts)
+            Ts = quadratic_form.gauss_newton_step(
+                quadratic_form.expand(total), Ts
+            )
         of_all = int(np.argmin(quadratic_form.monomials(Ts) @ total))
         best, objectives = self.settle(self.anneal(Ts[[of_all]]))
         objective = objectives[0]
@@ -261,7 +276,9 @@ class _Search:
             before = objective
             # The first rivals come from subsets of the inliers, the others from subsets of all.
             for first, share in ((0, 1.0), (_N_PROMISING, _CLEARLY_SMALLER)):
-                rival = first + int(np.argmin(objectives[first : first + _N_PROMISING]))
+                rival = first + int(
+                    np.argmin(objectives[first : first + _N_PROMISING])
+                )
                 if objectives[rival] < share * objective:
                     best = rivals[[rival]]
                     objective = objectives[rival]
@@ -286,12 +303,18 @@ class _Search:
         of_inliers = shares[:, None] * inliers
         of_all = sizes[:, None] * np.full(n_pairs, 1 / n_pairs)
         probabilities = np.concatenate([of_inliers, of_all])
-        weights = (random.random(probabilities.shape) < probabilities).astype(float)
+        weights = (random.random(probabilities.shape) < probabilities).astype(
+            float
+        )
         Ts = np.repeat(T, len(weights), axis=0)
         for _ in range(_FIRST_ROUNDS):
             Ts = self.refit(weights, Ts)
-            weights, objectives = truncate(self.costs(Ts), self.threshold, self.floor)
-        order = np.argsort(objectives.reshape(2, n_rivals), axis=1, kind="stable")
+            weights, objectives = truncate(
+                self.costs(Ts), self.threshold, self.floor
+            )
+        order = np.argsort(
+            objectives.reshape(2, n_rivals), axis=1, kind="stable"
+        )
         promising = order[:, :_N_PROMISING]
         return np.concatenate([Ts[promising[0]], Ts[n_rivals + promising[1]]])
 
@@ -306,7 +329,9 @@ class _Search:
         sharpness = np.zeros(len(Ts))
         while True:
             costs = self.costs(Ts)
-            truncation = np.maximum(self.threshold, np.partition(costs, last)[:, last])
+            truncation = np.maximum(
+                self.threshold, np.partition(costs, last)[:, last]
+            )
             if not sharpness.any():
                 # First round: the weights of all pairs are above zero.
                 largest = costs.max(axis=1)
@@ -355,7 +380,9 @@ class _Search:
         for _ in range(_MAX_ROUNDS):
             Ts_new = self.refit(weights, Ts[active])
             before = objectives[active]
-            costs = self.costs(Ts_new, None if left_out is None else left_out[active])
+            costs = self.costs(
+                Ts_new, None if left_out is None else left_out[active]
+            )
             weights, after = truncate(costs, self.threshold, self.floor)
             better = after < before
             Ts[active[better]] = Ts_new[better]

@@ -21,7 +21,11 @@ casadi = required("casadi", "backend ipopt", "casadi")
 # CasADi has no type annotations.
 _Expression: TypeAlias = Any
 
-_IPOPT_OPTIONS = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+_IPOPT_OPTIONS = {
+    "print_time": False,
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+}
 
 
 def solve_dnl(pairs: MotionPairs) -> Solution:
@@ -99,12 +103,16 @@ def _cost_expressions(pairs: MotionPairs, pose: _Expression) -> _Expression:
         - rotation @ motion_b[:, 3]
         - translation
     )
-    cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(translation_residual)
+    cost = casadi.sumsqr(rotation_residual) + casadi.sumsqr(
+        translation_residual
+    )
     columns_a = casadi.vec(motion_a)
     columns_b = casadi.vec(motion_b)
     function = casadi.Function("cost", [x, columns_a, columns_b], [cost])
     return function.map(len(pairs))(
-        pose, _columns(pairs.Ts_parenti_parentj), _columns(pairs.Ts_childi_childj)
+        pose,
+        _columns(pairs.Ts_parenti_parentj),
+        _columns(pairs.Ts_childi_childj),
     )
 
 

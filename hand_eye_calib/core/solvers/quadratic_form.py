@@ -108,7 +108,9 @@ def condense(pairs: MotionPairs) -> FloatArray:
     upper = _ROWS * DIMENSION + _COLUMNS
     for start in range(0, len(pairs), _BLOCK):
         block = slice(start, start + _BLOCK)
-        residuals = (u[block] @ _RESIDUAL.reshape(24, -1)).reshape(-1, 12, DIMENSION)
+        residuals = (u[block] @ _RESIDUAL.reshape(24, -1)).reshape(
+            -1, 12, DIMENSION
+        )
         # numpy multiplies two arrays of small matrices faster than it squares one.
         forms = residuals.swapaxes(1, 2) @ residuals.copy()
         condensed[block] = forms.reshape(-1, DIMENSION**2).take(upper, axis=1)
@@ -164,7 +166,9 @@ def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
-        moments += (coefficients[block] * weights[block, None]).T @ coefficients[block]
+        moments += (
+            coefficients[block] * weights[block, None]
+        ).T @ coefficients[block]
     by_residual = (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
     return _RESIDUAL.reshape(-1, DIMENSION).T @ by_residual
 
@@ -269,7 +273,9 @@ def without_translation(Q: FloatArray) -> tuple[FloatArray, FloatArray]:
     values, vectors = np.linalg.eigh(of_translation)
     largest = np.maximum(values[:, -1:], np.finfo(float).tiny)
     is_observed = values > _RANK_TOLERANCE * largest
-    inverse_values = np.divide(1.0, values, np.zeros_like(values), where=is_observed)
+    inverse_values = np.divide(
+        1.0, values, np.zeros_like(values), where=is_observed
+    )
     inverse = (vectors * inverse_values[:, None]) @ vectors.swapaxes(1, 2)
     eliminated = coupling.swapaxes(1, 2) @ inverse @ coupling
     return of_others - eliminated, inverse @ coupling

@@ -39,7 +39,9 @@ class _Solver(NamedTuple):
 
     solve: Callable[..., Solution]
     solve_near: Callable[..., Solution] | None = None
-    solve_best_stride: Callable[[FloatArray, FloatArray], robust.Stride] | None = None
+    solve_best_stride: (
+        Callable[[FloatArray, FloatArray], robust.Stride] | None
+    ) = None
 
 
 # Taylor's method has the same solution as Park's.
@@ -129,7 +131,9 @@ class Method:
         Q = quadratic_form.weighted_sum(
             quadratic_form.coefficients(pairs), solution.weights
         )
-        return "yes" if certificate.is_global(Q, solution.T_parent_child) else "no"
+        return (
+            "yes" if certificate.is_global(Q, solution.T_parent_child) else "no"
+        )
 
     def solve_without(
         self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
@@ -153,7 +157,11 @@ class Method:
         if self.name == "dnlo":
             # Iterations from the solution take less time than a search for it.
             return dnlo.solve_without(
-                pairs, solution, left_out, self.threshold, self.min_inlier_fraction
+                pairs,
+                solution,
+                left_out,
+                self.threshold,
+                self.min_inlier_fraction,
             )
         solve = self.solve
         if solve_near := _SOLVERS[self.name].solve_near:

@@ -180,7 +180,9 @@ def solve_strides(
             every_by_overlap = n_poses // _MOTIONS_PER_STRIDE
             every_by_number = math.ceil(len(pairs) / _MAX_MOTIONS)
             pairs = pairs[:: max(every_by_overlap, every_by_number, 1)]
-            strides.append(Stride(reference, pairs, solve(pairs, T_start, tolerance)))
+            strides.append(
+                Stride(reference, pairs, solve(pairs, T_start, tolerance))
+            )
     return strides
 
 
@@ -207,7 +209,9 @@ def _components(
     """
     # Motion X^-1 A X of the child, predicted from the motion of the parent.
     # One product of two-dimensional matrices takes less time than many small ones.
-    moved = (pairs.Ts_parenti_parentj.reshape(-1, 4) @ T_parent_child).reshape(-1, 4, 4)
+    moved = (pairs.Ts_parenti_parentj.reshape(-1, 4) @ T_parent_child).reshape(
+        -1, 4, 4
+    )
     predicted = se3.inverse(T_parent_child) @ moved
     errors = se3.inverse(pairs.Ts_childi_childj) @ predicted
     # For a predicted motion Y, Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order. The
@@ -221,7 +225,9 @@ def _components(
 
 def _scales(components: tuple[_Component, _Component]) -> FloatArray:
     """Return the standard deviations (2,) of both components, from medians of residuals."""
-    medians = [median(np.abs(component.residuals).ravel()) for component in components]
+    medians = [
+        median(np.abs(component.residuals).ravel()) for component in components
+    ]
     sigmas = np.array(medians) / MEDIAN_NORMAL
     return np.maximum(sigmas, _MIN_SCALE)
 
@@ -233,13 +239,17 @@ def _weights(
     squared = []
     for component, scale in zip(components, scales, strict=True):
         squared.append(
-            (component.residuals**2).sum(axis=1) / 3.0 / (_CAUCHY_UNIT * scale) ** 2
+            (component.residuals**2).sum(axis=1)
+            / 3.0
+            / (_CAUCHY_UNIT * scale) ** 2
         )
     return robust_weights("cauchy", np.array(squared))
 
 
 def _normal_equations(
-    components: tuple[_Component, _Component], scales: FloatArray, weights: FloatArray
+    components: tuple[_Component, _Component],
+    scales: FloatArray,
+    weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weighted Hessian (6, 6), and the scores (2, K, 6).
 
@@ -267,11 +277,15 @@ def _covariance(
     """
     # The weight of a pair decreases as its residual grows. The weighted Hessian does not contain
     # this term of the second derivative.
-    curvature = 2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
+    curvature = (
+        2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
+    )
     n_poses = int(pairs.j.max() - pairs.i.min())
     motion = median(pairs.j - pairs.i)
     # Correlation time in poses, then in pairs.
-    n_correlated_poses = max(_CORRELATED_SHARE * n_poses, _CORRELATED_MOTIONS * motion)
+    n_correlated_poses = max(
+        _CORRELATED_SHARE * n_poses, _CORRELATED_MOTIONS * motion
+    )
     window = round(n_correlated_poses * len(pairs) / n_poses)
     window = min(max(window, 1), len(pairs) // 2 + 1)
     # Residuals are smaller than errors, because the six unknowns fit some of the errors. The factor
@@ -279,11 +293,15 @@ def _covariance(
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
     return (
-        n_motions / n_free * _sandwich(hessian - curvature, scores.sum(axis=0), window)
+        n_motions
+        / n_free
+        * _sandwich(hessian - curvature, scores.sum(axis=0), window)
     )
 
 
-def _sandwich(hessian: FloatArray, scores: FloatArray, window: int) -> FloatArray:
+def _sandwich(
+    hessian: FloatArray, scores: FloatArray, window: int
+) -> FloatArray:
     """Return the covariance (6, 6) from sums of scores (K, 6) over windows of consecutive pairs."""
     total = np.cumsum(np.vstack([np.zeros(6), scores]), axis=0)
     sums = total[window:] - total[:-window]
@@ -364,7 +382,9 @@ def _start(pairs: MotionPairs) -> FloatArray:
         starts.append(se3.from_rotation_translation(rotation, translation))
         # The misfit of rotation, as a share of the rotation, is converted to a share of the
         # translation in m.
-        misfits_m.append(misfit_m + misfit_rad / angle_rad * _median_length(targets))
+        misfits_m.append(
+            misfit_m + misfit_rad / angle_rad * _median_length(targets)
+        )
     return starts[int(np.argmin(misfits_m))]
 
 
@@ -382,7 +402,9 @@ def _weighted_translation(
     """
     weighted_slopes = (weights[:, None, None] * slopes).reshape(-1, 3)
     weighted_targets = (weights[:, None] * targets).ravel()
-    translation, *_ = np.linalg.lstsq(weighted_slopes, weighted_targets, rcond=1e-9)
+    translation, *_ = np.linalg.lstsq(
+        weighted_slopes, weighted_targets, rcond=1e-9
+    )
     return np.asarray(translation, dtype=float)
 
 

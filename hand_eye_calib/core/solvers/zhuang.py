@@ -54,7 +54,9 @@ def solve(pairs: MotionPairs) -> Solution:
     _, objective_near_park, _ = _gauss_newton(M, near_park)
     # The cost at a false minimum is higher than that of the minimum near the solution of Park.
     rounding = _ROUNDING**2 * float((M**2).sum())
-    is_lowest = objective <= objective_near_park / (1 - _MIN_DIFFERENCE) + rounding
+    is_lowest = (
+        objective <= objective_near_park / (1 - _MIN_DIFFERENCE) + rounding
+    )
     T_parent_child = se3.from_rotation_translation(
         _rotation(parameters[:3]), parameters[3:]
     )

@@ -61,7 +61,11 @@ def figures_of_clouds(
     except InputError as error:
         caption = f"The clouds cannot be read: {error}."
         return [Drawn(f"clouds{suffix}", _title(calibration), caption, "")]
-    return [] if merged is None else [_drawn(calibration, merged, f"clouds{suffix}")]
+    return (
+        []
+        if merged is None
+        else [_drawn(calibration, merged, f"clouds{suffix}")]
+    )
 
 
 def _title(calibration: Calibration) -> str:
@@ -77,7 +81,9 @@ def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
     is_parent_tall, is_child_tall = _above_ground(merged)
     tall = merged.parent[is_parent_tall]
     limits = np.quantile(
-        np.vstack([tall, merged.after[is_child_tall]]), (_OUTSIDE, 1 - _OUTSIDE), axis=0
+        np.vstack([tall, merged.after[is_child_tall]]),
+        (_OUTSIDE, 1 - _OUTSIDE),
+        axis=0,
     )
     # A margin of 5 %, and at least half a metre for heights.
     margin = np.maximum(0.05 * np.ptp(limits, axis=0), 0.5)
@@ -85,12 +91,16 @@ def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
     high = limits[1] + margin
     # The ground is in the view from the side.
     low[2] = min(low[2], np.quantile(merged.parent[:, 2], _OUTSIDE) - margin[2])
-    panel_inches = np.multiply(panels[0].get_position().size, figure.get_size_inches())
+    panel_inches = np.multiply(
+        panels[0].get_position().size, figure.get_size_inches()
+    )
     above, side = panels[:2], panels[2:]
     low[:2], high[:2] = _with_equal_scales(panel_inches, low[:2], high[:2])
     for column, child in enumerate((merged.before, merged.after)):
         above[column].set(title=titles[column])
-        _draw_view(above[column], (tall, child[is_child_tall]), (0, 1), low, high)
+        _draw_view(
+            above[column], (tall, child[is_child_tall]), (0, 1), low, high
+        )
         slices = (_slice(merged.parent), _slice(child))
         _draw_view(side[column], slices, (0, 2), low, high)
         side[column].set_xlabel("x (m)")
@@ -168,7 +178,9 @@ def _draw_view(
         if len(cells):
             codes = np.tile([Outline.MOVETO, Outline.LINETO], len(cells))
             dots = Outline(np.repeat(cells, 2, axis=0), codes)
-            panel.add_patch(PathPatch(dots, ec=colour, lw=width, capstyle="round"))
+            panel.add_patch(
+                PathPatch(dots, ec=colour, lw=width, capstyle="round")
+            )
 
 
 def _caption(calibration: Calibration, merged: MergedClouds) -> str:

@@ -102,7 +102,9 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
             (snapshot.parent_names, 0),
             (snapshot.child_names, offset_ns),
         ):
-            topic = topics_of.get(names.sensor) or topics_of.get(names.option) or ""
+            topic = (
+                topics_of.get(names.sensor) or topics_of.get(names.option) or ""
+            )
             if not topic:
                 return None
             cloud = _scans(bag, topic, instants_ns - shift_ns)
@@ -111,7 +113,9 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
     if not (len(own.points) and len(other.points)):
         return None
     own_in_world = _placed(own, parent, np.eye(4))
-    T_picture_world, is_upright = _axes_of_picture(parent, instants_ns[0], own_in_world)
+    T_picture_world, is_upright = _axes_of_picture(
+        parent, instants_ns[0], own_in_world
+    )
     installed = installed_transform(calibration)
     T_before = np.eye(4) if installed is None else installed
     in_picture = [
@@ -119,7 +123,9 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
         _placed(other, parent, T_before),
         _placed(other, parent, calibration.T_parent_child),
     ]
-    points, before, after = [_moved(T_picture_world, cloud) for cloud in in_picture]
+    points, before, after = [
+        _moved(T_picture_world, cloud) for cloud in in_picture
+    ]
     rotations = se3.rotation_of(parent.at(instants_ns))
     turns = [_angles(rotations, rotation).max() for rotation in rotations]
     return MergedClouds(
@@ -137,10 +143,14 @@ def installed_transform(calibration: Calibration) -> FloatArray | None:
     if comparison is None or not comparison.values:
         return None
     values = np.array([comparison.values[axis] for axis in AXES])
-    return se3.from_rotation_translation(se3.rotation_from_rpy(values[3:]), values[:3])
+    return se3.from_rotation_translation(
+        se3.rotation_from_rpy(values[3:]), values[:3]
+    )
 
 
-def distances_from_surfaces(surfaces: FloatArray, points: FloatArray) -> FloatArray:
+def distances_from_surfaces(
+    surfaces: FloatArray, points: FloatArray
+) -> FloatArray:
     """Return the distances (M,) of points (M, 3) from the planes through their neighbours, m.
 
     ``surfaces`` (N, 3) are points of the surfaces. The distance of a point without a plane nearby
@@ -150,7 +160,9 @@ def distances_from_surfaces(surfaces: FloatArray, points: FloatArray) -> FloatAr
     return np.abs(np.einsum("ni,ni->n", points - means, normals))
 
 
-def _planes(surfaces: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _planes(
+    surfaces: FloatArray, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the means and the normals (M, 3) of the planes of surfaces near points (M, 3).
 
     They are NaN without a plane nearby.
@@ -166,7 +178,9 @@ def _planes(surfaces: FloatArray, points: FloatArray) -> tuple[FloatArray, Float
     neighbours = surfaces[rows[near]]
     centers = neighbours.mean(axis=1)
     offsets = neighbours - centers[:, None]
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+    variances, axes = np.linalg.eigh(
+        np.einsum("nki,nkj->nij", offsets, offsets)
+    )
     is_flat = variances[:, 0] < TUNING.max_flat * variances[:, 1]
     means[near[is_flat]] = centers[is_flat]
     normals[near[is_flat]] = axes[is_flat, :, 0]
@@ -207,7 +221,9 @@ def _instants(parent: Trajectory, child: Trajectory) -> IntArray:
     )
     rates = np.r_[steps_rad, np.inf] + np.r_[np.inf, steps_rad]
     chosen = []
-    for row in np.linspace(start, start + length, TUNING.n_scans).round().astype(int):
+    for row in (
+        np.linspace(start, start + length, TUNING.n_scans).round().astype(int)
+    ):
         first = max(row - 2, 0)
         chosen.append(first + int(np.argmin(rates[first : row + 3])))
     return np.asarray(stamps_ns[np.unique(chosen)])
@@ -246,7 +262,9 @@ def _bag_delay(bag: PoseBag, topic: str) -> int:
     return int(run.bag_ns[0]) - stamp_ns
 
 
-def _nearest(bag: PoseBag, topic: str, bag_ns: int, reach_ns: int) -> Run | None:
+def _nearest(
+    bag: PoseBag, topic: str, bag_ns: int, reach_ns: int
+) -> Run | None:
     """Return the message of a topic that is nearest to a bag time; None if none is in reach."""
     nearest = None
     smallest_ns = reach_ns
@@ -256,7 +274,8 @@ def _nearest(bag: PoseBag, topic: str, bag_ns: int, reach_ns: int) -> Run | None
         if distances_ns[row] < smallest_ns:
             smallest_ns = int(distances_ns[row])
             nearest = run._replace(
-                messages=run.messages[row : row + 1], bag_ns=run.bag_ns[row : row + 1]
+                messages=run.messages[row : row + 1],
+                bag_ns=run.bag_ns[row : row + 1],
             )
     return nearest
 
@@ -302,7 +321,9 @@ def _moved(T: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
 
-def _axis_of_surfaces(surfaces: FloatArray, direction: FloatArray) -> FloatArray:
+def _axis_of_surfaces(
+    surfaces: FloatArray, direction: FloatArray
+) -> FloatArray:
     """Return the principal axis (3,) of the normals of surfaces (N, 3).
 
     Of the three principal axes, it is the one nearest to the direction. Without planes, it is any

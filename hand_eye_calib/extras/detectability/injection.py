@@ -42,7 +42,11 @@ from hand_eye_calib.core.checks.findings import LIMITS
 from hand_eye_calib.core.checks.stream_pair import LAGS_S, MIN_PAIRS
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs, pairs_over
+from hand_eye_calib.core.pairing.motion_pairs import (
+    MotionPairs,
+    PosePairs,
+    pairs_over,
+)
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, DofVerdict
 from hand_eye_calib.extras.detectability.record import (
@@ -112,7 +116,9 @@ def examine(result: Calibration, snapshot: Snapshot) -> Calibration:
 def on_clock_of(result: Calibration, snapshot: Snapshot) -> PosePairs:
     """Return the poses of a result with its time offset and its scale."""
     pose_pairs = snapshot.pose_pairs.child_scaled(result.scale)
-    further_s = result.time_offset_s - float(snapshot.resolved.config.time_offset)
+    further_s = result.time_offset_s - float(
+        snapshot.resolved.config.time_offset
+    )
     if not further_s:
         return pose_pairs
     return pose_pairs.child_shifted(further_s)
@@ -137,11 +143,17 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
         estimated.append(_SCALE)
     sigmas, allowance = sigmas_of(result)
     R = se3.rotation_of(X)
-    errors = _smallest_errors(blocks, [*_OF_X, *estimated], R, sigmas, allowance)
+    errors = _smallest_errors(
+        blocks, [*_OF_X, *estimated], R, sigmas, allowance
+    )
     # Time offset and scale are stated even if the solve did not estimate them.
     of_streams = [*_OF_X, _TIME_OFFSET, _SCALE]
-    errors_of_streams = _smallest_errors(blocks, of_streams, R, sigmas, allowance)
-    is_known = [dof.verdict in _BY_MOTION for dof in result.observability_measured]
+    errors_of_streams = _smallest_errors(
+        blocks, of_streams, R, sigmas, allowance
+    )
+    is_known = [
+        dof.verdict in _BY_MOTION for dof in result.observability_measured
+    ]
     # Sizes of shifts that are tried first. They grow until the stream check reports the shift.
     first_shifts = _first_shifts(blocks, R)
     return Detectability(
@@ -168,7 +180,9 @@ def sigmas_of(result: Calibration) -> tuple[FloatArray, FloatArray]:
     # Unknown axes have no finite standard deviation, and no size is stated for them.
     measured = np.nan_to_num(result.sigmas_measured, posinf=0.0)
     of_streams = np.zeros(2)
-    return np.append(measured, of_streams), np.append(result.allowance, of_streams)
+    return np.append(measured, of_streams), np.append(
+        result.allowance, of_streams
+    )
 
 
 # Verdicts on axes that the motion determines.
@@ -182,7 +196,9 @@ def _by_axis(sizes: FloatArray, is_known: list[bool]) -> dict[str, float]:
     return dict(zip(AXES, stated.tolist(), strict=True))
 
 
-def _columns_of_streams(pairs: MotionPairs, pose_pairs: PosePairs) -> FloatArray:
+def _columns_of_streams(
+    pairs: MotionPairs, pose_pairs: PosePairs
+) -> FloatArray:
     """Return the columns (K, 6, 2) of J for errors of the time offset (s) and of the scale."""
     stamps_ns = pose_pairs.stamps_ns
     poses = pose_pairs.Ts_cw_c
@@ -191,7 +207,9 @@ def _columns_of_streams(pairs: MotionPairs, pose_pairs: PosePairs) -> FloatArray
     before = np.maximum(rows - step, 0)
     after = np.minimum(rows + step, len(poses) - 1)
     seconds = (stamps_ns[after] - stamps_ns[before]) * 1e-9
-    twists = se3.log(se3.inverse(poses[before]) @ poses[after]) / seconds[:, None]
+    twists = (
+        se3.log(se3.inverse(poses[before]) @ poses[after]) / seconds[:, None]
+    )
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
     of_time_offset = (
         se3.times(se3.adjoint(Bs_inverse), twists[pairs.i]) - twists[pairs.j]
@@ -216,7 +234,9 @@ def _smallest_errors(
     sigmas, differences = trials(blocks, columns, R, sigmas)
     thresholds = thresholds_of(_SIGMA_MARGIN * sigmas, allowance[columns])
     # A trial finds an error of either sign.
-    found_from = np.quantile(thresholds + np.abs(differences), FOUND_SHARE, axis=0)
+    found_from = np.quantile(
+        thresholds + np.abs(differences), FOUND_SHARE, axis=0
+    )
     return np.asarray(found_from)
 
 
@@ -248,7 +268,9 @@ def trials(
     for n_blocks in _JACKKNIFE_BLOCKS:
         if len(blocks.sums) >= 2 * n_blocks:
             covariance = blocks.merged(n_blocks).jackknife(columns)
-            sigmas = np.maximum(sigmas, np.sqrt(np.diag(turn @ covariance @ turn.T)))
+            sigmas = np.maximum(
+                sigmas, np.sqrt(np.diag(turn @ covariance @ turn.T))
+            )
     differences = _differences_of_halves(blocks, columns) @ turn.T
     return sigmas, differences
 
@@ -291,9 +313,9 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     threshold = 2.0 * (moved.SIGNIFICANT - moved.log_ratio(evidence))
     # Columns are the scores of unit shifts along the parent's axes.
     scores = H @ np.kron(np.eye(2), R.T)
-    squares = (scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)).sum(
-        axis=0
-    )
+    squares = (
+        scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)
+    ).sum(axis=0)
     # Without motion, no shift along an axis changes the score: its size is unlimited.
     sizes = np.full(6, np.inf)
     np.divide(threshold, squares, out=sizes, where=squares > 0.0)
@@ -301,7 +323,10 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
 
 
 def _reported_shifts(
-    pose_pairs: PosePairs, X: FloatArray, first: FloatArray, is_known: list[bool]
+    pose_pairs: PosePairs,
+    X: FloatArray,
+    first: FloatArray,
+    is_known: list[bool],
 ) -> dict[str, float]:
     """Return the smallest shifts that the stream check reports, by axis.
 

@@ -126,9 +126,7 @@ def _of_streams(value: Detectability) -> str:
         return ""
     milliseconds = two_digits(1e3 * value.time_offset_s)
     percent = two_digits(1e2 * value.scale)
-    return (
-        f", {milliseconds} ms between the clocks and {percent}% of the child's lengths"
-    )
+    return f", {milliseconds} ms between the clocks and {percent}% of the child's lengths"
 
 
 def _amounts(sizes: Mapping[str, float]) -> str:
@@ -136,7 +134,9 @@ def _amounts(sizes: Mapping[str, float]) -> str:
     texts = []
     for axis, size in sizes.items():
         if math.isfinite(size):
-            direction = f"about {ABOUT[axis]}" if axis in ABOUT else f"along {axis}"
+            direction = (
+                f"about {ABOUT[axis]}" if axis in ABOUT else f"along {axis}"
+            )
             texts.append(f"{amount(axis, size)} {direction}")
     return listing(texts)
 
@@ -161,7 +161,9 @@ def find_undetectable(result: Any) -> Iterator[Ground]:
     detectability = result.parts.get("detectability")
     if detectability is None:
         return
-    if any(dof.verdict is DofVerdict.PRIOR for dof in result.observability_measured):
+    if any(
+        dof.verdict is DofVerdict.PRIOR for dof in result.observability_measured
+    ):
         # A prior or the ground determines more than the motion can contradict.
         return
     sizes = {}

@@ -21,7 +21,8 @@ def register() -> None:
     PUBLIC_NAMES["calibrate_many"] = "hand_eye_calib.extras.fleet.together"
     PUBLIC_NAMES["calibrate_together"] = "hand_eye_calib.extras.fleet.together"
     COMMANDS["compare"] = Command(
-        "compare results with the installed transform, or with each other", _compare
+        "compare results with the installed transform, or with each other",
+        _compare,
     )
     COMMANDS["batch"] = Command(
         "calibrate many recordings, such as those of a fleet", _batch
@@ -60,9 +61,7 @@ def _add_arguments(parser: Any) -> None:
     from hand_eye_calib.offline.cli.options import at_least
 
     add = parser.add_argument_group("many recordings").add_argument
-    batch = (
-        "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
-    )
+    batch = "bags, folders of bags, or patterns of bags in quotes, such as 'fleet/*/drive'"
     add("--batch", metavar="BAG", nargs="+", help=batch)
     vehicle = (
         "the vehicle's name, or its position in the paths of --batch, such "

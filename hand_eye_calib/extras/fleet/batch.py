@@ -21,7 +21,13 @@ from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.extras.fleet import work
 from hand_eye_calib.extras.fleet.records import CONTRADICTIONS, is_in_headline
 from hand_eye_calib.extras.fleet.together import together
-from hand_eye_calib.extras.fleet.work import Outcome, Row, Task, outcomes, tasks_of
+from hand_eye_calib.extras.fleet.work import (
+    Outcome,
+    Row,
+    Task,
+    outcomes,
+    tasks_of,
+)
 from hand_eye_calib.formats.bags.patterns import is_other_file, matching
 from hand_eye_calib.formats.results import save_result, save_text
 from hand_eye_calib.offline.beside_motion import switched_off
@@ -33,7 +39,12 @@ from hand_eye_calib.offline.cli.options import (
     waiting_for,
     with_progress,
 )
-from hand_eye_calib.offline.cli.present import deliver, exit_code, gravest_code, wrapped
+from hand_eye_calib.offline.cli.present import (
+    deliver,
+    exit_code,
+    gravest_code,
+    wrapped,
+)
 from hand_eye_calib.offline.cli.reporting import REPORT
 
 # Largest number of results on the terminal. rows.csv contains all results.
@@ -58,7 +69,9 @@ def run_batch(arguments: argparse.Namespace) -> int:
     """
     title = " ".join(arguments.batch)
     with waiting_for(f"looking for {title}"):
-        paths = [path for pattern in arguments.batch for path in matching(pattern)]
+        paths = [
+            path for pattern in arguments.batch for path in matching(pattern)
+        ]
     if all(is_other_file(path) for path in paths):
         raise ConfigError(
             f"{paths[0]} is not a bag, and batch takes bags: for trajectory files, use calibrate "
@@ -113,8 +126,12 @@ def _print_json(
     document = {
         "batch": title,
         "counts": dict(Counter(outcome.verdict for outcome in done)),
-        "failures": [outcome.row["name"] for outcome in done if outcome.row["error"]],
-        "vehicles": {name: result.to_dict() for name, result in vehicles.items()},
+        "failures": [
+            outcome.row["name"] for outcome in done if outcome.row["error"]
+        ],
+        "vehicles": {
+            name: result.to_dict() for name, result in vehicles.items()
+        },
     }
     print(json_text(document).removesuffix("\n}") + ',\n  "results": [')
     print(",\n".join(f"    {outcome.text}" for outcome in done) + "\n  ]\n}")
@@ -134,14 +151,22 @@ def run_together(
         if outcome.row["verdict"]
     }
     if not usable:
-        errors = [f"{outcome.row['name']}: {outcome.row['error']}" for outcome in done]
+        errors = [
+            f"{outcome.row['name']}: {outcome.row['error']}" for outcome in done
+        ]
         raise InputError("; ".join(errors))
     result = together(usable)
     if arguments.out:
         _write_rows_and_page(
-            arguments.out, "recordings of one rig", done, {"rig": result}, REPORT
+            arguments.out,
+            "recordings of one rig",
+            done,
+            {"rig": result},
+            REPORT,
         )
-    inputs = {"recordings": {outcome.row["name"]: outcome.inputs for outcome in done}}
+    inputs = {
+        "recordings": {outcome.row["name"]: outcome.inputs for outcome in done}
+    }
     code = deliver(result, inputs, arguments)
     return 1 if any(outcome.row["error"] for outcome in done) else code
 
@@ -162,7 +187,9 @@ def _all_done(
     )
     done = _earlier_outcomes(tasks, out) if out else {}
     waiting = [task for task in tasks if task.name not in done]
-    running = outcomes(waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask)
+    running = outcomes(
+        waiting, arguments.jobs or os.cpu_count() or 1, arguments.dask
+    )
     for task, outcome in with_progress(running, len(waiting), "calibrating"):
         done[task.name] = outcome._replace(page="")
         if out:
@@ -175,7 +202,9 @@ def _all_done(
     return [done[task.name] for task in tasks]
 
 
-def _earlier_outcomes(tasks: Sequence[Task], directory: Path) -> dict[str, Outcome]:
+def _earlier_outcomes(
+    tasks: Sequence[Task], directory: Path
+) -> dict[str, Outcome]:
     """Return the outcomes of an earlier run by the names of their tasks."""
     done: dict[str, Outcome] = {}
     for task in with_progress(tasks, len(tasks), "looking for earlier results"):
@@ -260,13 +289,17 @@ def _vehicles(
         texts = "\n".join(outcome.text for outcome in group)
         digest = hashlib.sha256(texts.encode()).hexdigest()
         task = Task(
-            name=f"{work.VEHICLES}/{vehicle}", bags=(), options={"results": digest}
+            name=f"{work.VEHICLES}/{vehicle}",
+            bags=(),
+            options={"results": digest},
         )
         earlier = stored(task, directory) if directory else None
         if earlier:
             results[vehicle] = earlier.calibration
             continue
-        recordings = {outcome.row["name"]: outcome.calibration for outcome in group}
+        recordings = {
+            outcome.row["name"]: outcome.calibration for outcome in group
+        }
         if len(recordings) == 1:
             (results[vehicle],) = recordings.values()
         else:
@@ -292,11 +325,15 @@ def _write_rows_and_page(
     rows = [outcome.row for outcome in done]
     write_rows(directory / work.TABLE, rows)
     linked = {
-        row["name"] for row in rows if (directory / row["name"] / REPORT).exists()
+        row["name"]
+        for row in rows
+        if (directory / row["name"] / REPORT).exists()
     }
     # The rows of the page contain the results of vehicles with a single recording.
     with_several = {
-        name: result for name, result in vehicles.items() if "together" in result.parts
+        name: result
+        for name, result in vehicles.items()
+        if "together" in result.parts
     }
     save_text(directory / page, render_batch(title, rows, with_several, linked))
     for name in (work.TABLE, page):

@@ -31,7 +31,14 @@ from hand_eye_calib.offline.report.style import (
     page_style,
 )
 
-_AXES = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+_AXES = {
+    "x": "m",
+    "y": "m",
+    "z": "m",
+    "roll": "deg",
+    "pitch": "deg",
+    "yaw": "deg",
+}
 # Tones of verdicts, the gravest first.
 _GRAVITY = ("bad", "warn", "good")
 # Height of the figure of a vehicle, inches.
@@ -66,16 +73,22 @@ def render_batch(
     cells = [_cells(row, row["name"] in with_report) for row in rows]
     cells.sort(key=lambda cells_of_row: _gravity(cells_of_row.verdict))
     counts = Counter(cells_of_row.verdict for cells_of_row in cells)
-    ordered = sorted(vehicles.items(), key=lambda item: _gravity(item[1].verdict.value))
+    ordered = sorted(
+        vehicles.items(), key=lambda item: _gravity(item[1].verdict.value)
+    )
     shown_vehicles = []
-    for number, (name, result) in enumerate(ordered[: LOOK.max_vehicles], start=1):
+    for number, (name, result) in enumerate(
+        ordered[: LOOK.max_vehicles], start=1
+    ):
         values = _values(row_of_result(result.to_dict()))
         shown_vehicles.append((name, result, values, _trend(result, number)))
     return page(
         Path(__file__).with_name("batch.html"),
         TONES.get(cells[0].verdict, "bad"),
         counted(len(rows), "recording"),
-        listing([f"{count:,} {verdict}" for verdict, count in counts.most_common()]),
+        listing(
+            [f"{count:,} {verdict}" for verdict, count in counts.most_common()]
+        ),
         batch=Path(title.rstrip("/*")).name or title,
         vehicles_left_out=max(0, len(ordered) - LOOK.max_vehicles),
         vehicles=shown_vehicles,
@@ -100,7 +113,9 @@ def _trend(result: Calibration, number: int) -> Drawn:
     recordings = together.recordings if together else ()
     figure = Figure(figsize=(LOOK.width, _HEIGHT), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
-    for axis, panel, sigma in zip(_AXES, panels, result.sigmas_measured, strict=True):
+    for axis, panel, sigma in zip(
+        _AXES, panels, result.sigmas_measured, strict=True
+    ):
         _draw_axis(panel, axis, sigma, recordings)
     locator = AutoDateLocator(minticks=2, maxticks=4)
     panels[0].xaxis.set_major_locator(locator)
@@ -129,7 +144,8 @@ def _draw_axis(
     days = date2num(stamps_ns)
     is_apart = np.array([bool(recording.left_out) for recording in recordings])
     points = [
-        (recording.deviations[axis], recording.sigmas[axis]) for recording in recordings
+        (recording.deviations[axis], recording.sigmas[axis])
+        for recording in recordings
     ]
     values, sigmas = factor * np.where(np.isfinite(points), points, np.nan).T
     band = factor * LOOK.sigmas * sigma

@@ -36,16 +36,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] RESULT ..."
     parser.epilog = _EPILOG
-    results = (
-        "extrinsic.yaml, or the directory that contains it; two or more without --with"
-    )
+    results = "extrinsic.yaml, or the directory that contains it; two or more without --with"
     parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
     installed = (
         "installed transform: a URDF, an earlier extrinsic.yaml, a file of "
         "another program (formats of info --as), a bag with /tf_static, or "
         '"X Y Z ROLL PITCH YAW" in m and rad'
     )
-    parser.add_argument("--with", dest="installed", metavar="SOURCE", help=installed)
+    parser.add_argument(
+        "--with", dest="installed", metavar="SOURCE", help=installed
+    )
     fleet = (
         "write a page with the history of the mount of each vehicle; every RESULT is then the "
         "folder of a vehicle with digests of the monitor"
@@ -56,7 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare results; return the exit code."""
-    from hand_eye_calib.core.assessment.comparison import compare, scatters_in_words
+    from hand_eye_calib.core.assessment.comparison import (
+        compare,
+        scatters_in_words,
+    )
     from hand_eye_calib.formats.results import load_result
     from hand_eye_calib.offline.cli.present import wrapped
 
@@ -71,7 +74,9 @@ def run(arguments: argparse.Namespace) -> int:
     results = [load_result(path) for path in arguments.results]
     for path, result in zip(arguments.results, results, strict=True):
         if result.status.failure:
-            raise InputError(f"{path}: {result.status.failure}; it cannot be compared")
+            raise InputError(
+                f"{path}: {result.status.failure}; it cannot be compared"
+            )
     installed = None
     if arguments.installed:
         from hand_eye_calib.formats.installed import open_installed

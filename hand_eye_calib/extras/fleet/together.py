@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.agreement import Agreement, unknown_directions
+from hand_eye_calib.core.assessment.agreement import (
+    Agreement,
+    unknown_directions,
+)
 from hand_eye_calib.core.assessment.comparison import (
     agreement_of_results,
     by_axis,
@@ -27,7 +30,11 @@ from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.geometry.trajectory import TrajectoryLike
-from hand_eye_calib.core.results.calibration import Calibration, Verdict, data_frame
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    Verdict,
+    data_frame,
+)
 from hand_eye_calib.core.results.records import (
     AXES,
     DofVerdict,
@@ -56,7 +63,14 @@ _COUNTS = ("n_poses", "n_pairs", "n_inliers")
 
 # Fields of the common result that are taken from the newest recording.
 _OF_NEWEST = (
-    *("reference", "backend", "measured", "stamp_ns", "parent_frame", "child_frame"),
+    *(
+        "reference",
+        "backend",
+        "measured",
+        "stamp_ns",
+        "parent_frame",
+        "child_frame",
+    ),
     *(
         "base_frame",
         "T_base_parent",
@@ -147,7 +161,9 @@ def calibrate_many(
     rows = []
     for name, pair in _named(recordings, names):
         try:
-            row = row_of_result(calibrate(*pair, **options).to_dict()) | {"error": None}
+            row = row_of_result(calibrate(*pair, **options).to_dict()) | {
+                "error": None
+            }
         except HandEyeCalibError as error:
             row = {"error": str(error)}
         rows.append({"name": name, **row})
@@ -179,13 +195,16 @@ def row_of_result(calibration: Document) -> Document:
     transform = calibration["T_parent_child"]
     row = {name: calibration[name] for name in _FIELDS_OF_ROW}
     row["verdict"] = str(calibration["verdict"]).replace("_", " ")
-    columns = [f"{axis}_m" for axis in AXES[:3]] + [f"{axis}_deg" for axis in AXES[3:]]
+    columns = [f"{axis}_m" for axis in AXES[:3]] + [
+        f"{axis}_deg" for axis in AXES[3:]
+    ]
     values = [*transform["translation"], *transform["rpy_deg"]]
     sigmas = [*transform["sigma_translation"], *transform["sigma_rpy_deg"]]
     for column, value, sigma in zip(columns, values, sigmas, strict=True):
         row |= {column: value, f"sigma_{column}": sigma}
     return row | {
-        f"{dof['name']}_is": dof["verdict"] for dof in calibration["observability"]
+        f"{dof['name']}_is": dof["verdict"]
+        for dof in calibration["observability"]
     }
 
 
@@ -211,15 +230,23 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         for name, result in results.items()
         if _is_unusable(result)
     }
-    usable = {name: result for name, result in results.items() if name not in left_out}
+    usable = {
+        name: result for name, result in results.items() if name not in left_out
+    }
     if not usable:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-        raise InputError(f"no recording can be used: {reasons or 'there is none'}")
+        reasons = "; ".join(
+            f"{name}: {reason}" for name, reason in left_out.items()
+        )
+        raise InputError(
+            f"no recording can be used: {reasons or 'there is none'}"
+        )
     agreement = agreement_of_results([*usable.values()])
     names = [*usable]
     for index in agreement.apart:
         left_out[names[index]] = "it does not belong to the others"
-    used = {name: result for name, result in usable.items() if name not in left_out}
+    used = {
+        name: result for name, result in usable.items() if name not in left_out
+    }
     # Unusable recordings are not compared.
     unknown = np.full(6, np.nan)
     deviations = dict.fromkeys(results, unknown)
@@ -251,7 +278,9 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
 def _is_unusable(result: Calibration) -> bool:
     """Return whether the verdict is DO NOT USE for another reason than unknown axes."""
     rules = {
-        reason.rule for reason in result.reasons if reason.verdict is Verdict.DO_NOT_USE
+        reason.rule
+        for reason in result.reasons
+        if reason.verdict is Verdict.DO_NOT_USE
     }
     return bool(rules - {"nothing_known"})
 
@@ -265,12 +294,16 @@ def _warnings_of(recordings: Mapping[str, Calibration]) -> tuple[str, ...]:
     warnings = []
     for warning, of_warning in names.items():
         is_common = len(of_warning) == len(recordings)
-        warnings.append(warning if is_common else f"{listing(of_warning)}: {warning}")
+        warnings.append(
+            warning if is_common else f"{listing(of_warning)}: {warning}"
+        )
     return tuple(warnings)
 
 
 def _joint(
-    recordings: Mapping[str, Calibration], agreement: Agreement, record: Together
+    recordings: Mapping[str, Calibration],
+    agreement: Agreement,
+    record: Together,
 ) -> Calibration:
     """Return the common result of recordings that agree, sorted by time."""
     used = [*recordings.values()]
@@ -296,7 +329,10 @@ def _joint(
         findings=_gravest_of_each(used),
         warnings=_warnings_of(recordings),
         parts={"together": record},
-        **{name: sum(getattr(result, name) for result in used) for name in _COUNTS},
+        **{
+            name: sum(getattr(result, name) for result in used)
+            for name in _COUNTS
+        },
         **{name: getattr(newest, name) for name in _OF_NEWEST},
     )
 

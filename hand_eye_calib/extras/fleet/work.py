@@ -18,7 +18,11 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, required
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError,
+    InputError,
+    required,
+)
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.python_path import starting_trusted
@@ -90,7 +94,10 @@ def _state(bag: str) -> list[Any]:
         files = sorted(path.iterdir())
     elif path.exists():
         files = [path]
-    return [[str(file), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+    return [
+        [str(file), file.stat().st_size, file.stat().st_mtime_ns]
+        for file in files
+    ]
 
 
 def tasks_of(
@@ -114,10 +121,14 @@ def tasks_of(
     for group, stem in zip(groups, stems, strict=True):
         name = stem.replace("/", "_")
         numbered = chain([name], (f"{name}_{number}" for number in count(2)))
-        name = next(candidate for candidate in numbered if candidate not in names)
+        name = next(
+            candidate for candidate in numbered if candidate not in names
+        )
         names.add(name)
         vehicle_name = _vehicle_of(group[0], vehicle)
-        tasks.append(Task(name=name, bags=tuple(group), vehicle=vehicle_name, **common))
+        tasks.append(
+            Task(name=name, bags=tuple(group), vehicle=vehicle_name, **common)
+        )
     return tasks
 
 
@@ -201,16 +212,23 @@ class Outcome(NamedTuple):
             "inputs": restore_urls(inputs),
             **more,
         }
-        row |= _times_of([inputs[stream] for stream in STREAMS if stream in inputs])
+        row |= _times_of(
+            [inputs[stream] for stream in STREAMS if stream in inputs]
+        )
         row |= {"verdict": None, "headline": None, "bags": " ".join(bags)}
         if document and result:
             row |= row_of_result(document) | {
                 "warnings": "; ".join(document["warnings"])
             }
-            row["findings"] = " ".join(finding.code for finding in result.findings)
+            row["findings"] = " ".join(
+                finding.code for finding in result.findings
+            )
         code = exit_code(result) if result and not error else 1
         return cls(
-            row, code, json.dumps(whole, separators=(",", ":")), restore_urls(page)
+            row,
+            code,
+            json.dumps(whole, separators=(",", ":")),
+            restore_urls(page),
         )
 
     @property
@@ -259,11 +277,15 @@ def work(task: Task) -> Outcome:
     try:
         with remote.local_copies(task.bags) as (paths, restore_urls):
             bags = [*map(Path, paths)]
-            recording = read_recording(bags, task.sources, task.options, task.without)
+            recording = read_recording(
+                bags, task.sources, task.options, task.without
+            )
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs
             page = (
-                render(result, recording.snapshot, inputs) if task.with_report else ""
+                render(result, recording.snapshot, inputs)
+                if task.with_report
+                else ""
             )
             error = result.reasons[0].sentence if result.has_failed else None
             return Outcome.of(task, error, result, inputs, page, restore_urls)
@@ -299,7 +321,11 @@ def outcomes(
     while waiting:
         group = waiting.pop(0)
         lost = dict[str, str]()
-        with _cluster(dask) if dask else _processes(min(jobs, len(group))) as executor:
+        with (
+            _cluster(dask)
+            if dask
+            else _processes(min(jobs, len(group))) as executor
+        ):
             futures = {executor.submit(do, task): task for task in group}
             for future in as_completed([*futures]):
                 task = futures.pop(future)
@@ -311,7 +337,10 @@ def outcomes(
         unfinished = [task for task in group if task.name in lost]
         if dask or len(group) == 1:
             for task in unfinished:
-                yield task, Outcome.of(task, _reason_of_loss(lost[task.name], dask))
+                yield (
+                    task,
+                    Outcome.of(task, _reason_of_loss(lost[task.name], dask)),
+                )
         else:
             waiting[:0] = _groups_to_repeat(unfinished, jobs)
 
@@ -320,10 +349,14 @@ def _reason_of_loss(error: str, dask: str | None) -> str:
     """Return a message about a task whose worker died again."""
     if dask:
         return f"the cluster lost it: {error}"
-    return "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
+    return (
+        "worker processes crash on it, perhaps for lack of memory: use --jobs 1"
+    )
 
 
-def _groups_to_repeat(unfinished: Sequence[Task], jobs: int) -> list[list[Task]]:
+def _groups_to_repeat(
+    unfinished: Sequence[Task], jobs: int
+) -> list[list[Task]]:
     """Return groups of tasks to repeat after a worker died.
 
     Workers begin tasks in order, so one of the first ``jobs`` tasks has killed the worker. Each of

@@ -22,7 +22,9 @@ def register() -> None:
         find=_disagreements,
     )
     BESIDE_MOTION["ground"] = BesideMotion(_add_arguments, _find, _topics)
-    PUBLIC_NAMES["calibrate_on_ground"] = "hand_eye_calib.extras.ground.calibrate"
+    PUBLIC_NAMES["calibrate_on_ground"] = (
+        "hand_eye_calib.extras.ground.calibrate"
+    )
     for name in (
         "ground_from_clouds",
         "gravity_from_accelerations",
@@ -48,7 +50,9 @@ def _add_arguments(parser: Any) -> None:
         "auto: if a bag has clouds of a lidar or an IMU in the frames of both sensors, the ground "
         "or gravity also measures z, roll and pitch. off: motion alone. Default: auto"
     )
-    parser.add_argument("--ground", choices=("auto", "off"), default="auto", help=words)
+    parser.add_argument(
+        "--ground", choices=("auto", "off"), default="auto", help=words
+    )
 
 
 def _find(paths: Any, snapshot: Any) -> Any:

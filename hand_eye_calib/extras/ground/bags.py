@@ -66,13 +66,17 @@ def verticals_of_bag(
     tracks = []
     for topic, stream in zip(topics, snapshot.streams, strict=True):
         try:
-            tracks.append(_track_of_bag(tuple(paths), topic, stream, other_source))
+            tracks.append(
+                _track_of_bag(tuple(paths), topic, stream, other_source)
+            )
         except (InputError, NotEnoughDataError) as error:
             return (), [f"ground and gravity are not used: {topic}: {error}"]
     sources = []
     for track, topic in zip(tracks, topics, strict=True):
         sources.append(f"{track.source} from {topic}")
-    text = f"{listing(sources)} are used; to use the motion alone, set ground off"
+    text = (
+        f"{listing(sources)} are used; to use the motion alone, set ground off"
+    )
     return (VerticalPair(*tracks),), [text]
 
 
@@ -106,7 +110,10 @@ def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:
 
 @lru_cache(maxsize=2)
 def _track_of_bag(
-    paths: tuple[Path, ...], topic: str, stream: Trajectory, other_source: Source
+    paths: tuple[Path, ...],
+    topic: str,
+    stream: Trajectory,
+    other_source: Source,
 ) -> VerticalTrack:
     """Return the vertical from a topic of a bag.
 

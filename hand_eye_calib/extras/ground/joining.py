@@ -25,7 +25,11 @@ from hand_eye_calib.core.base.stats import CHI2, MEDIAN_NORMAL, median, medians
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, SolveStatus
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    DofVerdict,
+    SolveStatus,
+)
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.rules import CONTRADICTED_SIGMAS
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
@@ -208,7 +212,10 @@ def _measured_axes(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
 
 
 def _differences(
-    parent: VerticalTrack, child: VerticalTrack, T: FloatArray, basis: FloatArray
+    parent: VerticalTrack,
+    child: VerticalTrack,
+    T: FloatArray,
+    basis: FloatArray,
 ) -> FloatArray:
     """Return differences (K, 2 or 3) between the parent and the child at each instant.
 
@@ -391,7 +398,10 @@ def _updated(
     is_from_ground = halves_variance(totals, calibration.sigmas)
     dofs = []
     for of_motion, sigma, has_prior in zip(
-        calibration.observability_measured, sigmas.tolist(), is_from_ground, strict=True
+        calibration.observability_measured,
+        sigmas.tolist(),
+        is_from_ground,
+        strict=True,
     ):
         dof = judged(of_motion.name, sigma)
         is_unobservable = dof.verdict is DofVerdict.UNOBSERVABLE

@@ -160,7 +160,9 @@ def _slopes(planes: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(planes[..., 0], planes[..., 1]))
 
 
-def _is_ground(cells: FloatArray, inliers: FloatArray, plane: FloatArray) -> bool:
+def _is_ground(
+    cells: FloatArray, inliers: FloatArray, plane: FloatArray
+) -> bool:
     """Return whether a plane is wide, not too steep, below nearly all cells, and no deck.
 
     Parameters

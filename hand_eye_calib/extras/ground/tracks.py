@@ -121,7 +121,9 @@ def ground_from_clouds(
         # The median vector is that of the road; single scans differ by noise and by walls.
         bend = medians(np.array(scans.bends).T)
         bend_rad = float(np.linalg.norm(bend))
-    return VerticalTrack(stamps_ns, np.array(normals), np.array(heights), bend_rad)
+    return VerticalTrack(
+        stamps_ns, np.array(normals), np.array(heights), bend_rad
+    )
 
 
 @dataclass
@@ -211,7 +213,9 @@ def gravity_from_accelerations(
     if len(stamps_ns):
         n_windows = int((stamps_ns[-1] - stamps_ns[0]) * 1e-9 / _WINDOW_S)
     if n_windows < 3:
-        raise NotEnoughDataError("accelerations and poses overlap for less than 15 s")
+        raise NotEnoughDataError(
+            "accelerations and poses overlap for less than 15 s"
+        )
     middles_ns, verticals = _verticals_of_windows(
         stamps_ns, forces, trajectory, n_windows
     )
@@ -231,7 +235,10 @@ def gravity_from_accelerations(
 
 
 def _verticals_of_windows(
-    stamps_ns: IntArray, forces: FloatArray, trajectory: Trajectory, n_windows: int
+    stamps_ns: IntArray,
+    forces: FloatArray,
+    trajectory: Trajectory,
+    n_windows: int,
 ) -> tuple[IntArray, FloatArray]:
     """Return the vertical times gravity in each of W windows, in the world of the poses.
 
@@ -323,7 +330,9 @@ def turning_axis(trajectory: Trajectory) -> FloatArray:
     # The eigenvalues are ascending.
     largest_other = _MAX_OTHER_SHARE**2 * squares[2]
     if squares[1] >= largest_other:
-        raise NotEnoughDataError("the sensor does not turn about the vertical alone")
+        raise NotEnoughDataError(
+            "the sensor does not turn about the vertical alone"
+        )
     axis = axes[:, 2]
     sign = np.sign(axis[2])
     return axis * sign

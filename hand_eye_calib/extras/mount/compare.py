@@ -30,12 +30,16 @@ def compare_digests(arguments: argparse.Namespace) -> int | None:
     """
     paths = [Path(path) for path in arguments.results]
     histories = (
-        _histories_of_fleet(paths) if arguments.fleet else _histories_of_mount(paths)
+        _histories_of_fleet(paths)
+        if arguments.fleet
+        else _histories_of_mount(paths)
     )
     if not histories:
         return None
     if arguments.installed:
-        raise ConfigError("digests contain their installed transform: omit --with")
+        raise ConfigError(
+            "digests contain their installed transform: omit --with"
+        )
     if arguments.fleet:
         names = distinct_names(arguments.results)
         _write_fleet(dict(zip(names, histories, strict=True)), arguments)
@@ -82,8 +86,12 @@ def _write_fleet(
     save_text(arguments.fleet, render_fleet(histories))
     document = None
     if arguments.json:
-        document = {name: history.document() for name, history in histories.items()}
-    lines = (f"{name}: {history.sentence}" for name, history in histories.items())
+        document = {
+            name: history.document() for name, history in histories.items()
+        }
+    lines = (
+        f"{name}: {history.sentence}" for name, history in histories.items()
+    )
     print_result(lines, document)
     note(f"wrote {arguments.fleet}")
 
@@ -91,9 +99,13 @@ def _write_fleet(
 def _lines(history: History) -> Iterator[str]:
     """Yield the lines for the terminal: the verdict, then a line for each session and change."""
     yield history.sentence
-    names = "".join(f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values())
+    names = "".join(
+        f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values()
+    )
     yield f"  {'session':<18}{'motion':>8}{names}"
-    by_index = {changepoint.index: changepoint for changepoint in history.changes}
+    by_index = {
+        changepoint.index: changepoint for changepoint in history.changes
+    }
     for index, (digest, offset) in enumerate(
         zip(history.digests, history.offsets, strict=True)
     ):

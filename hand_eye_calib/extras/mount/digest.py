@@ -100,7 +100,11 @@ def read_digest(path: Path) -> Digest | None:
     InputError
         If the file is a digest with missing or invalid values.
     """
-    if not path.is_file() or path.stat().st_size > _LARGEST or path.suffix != ".json":
+    if (
+        not path.is_file()
+        or path.stat().st_size > _LARGEST
+        or path.suffix != ".json"
+    ):
         return None
     try:
         document: Any = json.loads(path.read_text(encoding="utf-8"))
@@ -111,7 +115,10 @@ def read_digest(path: Path) -> Digest | None:
     try:
         for name, shape in _SHAPES.items():
             document[name] = np.array(document[name], dtype=float)
-            if document[name].shape != shape or not np.isfinite(document[name]).all():
+            if (
+                document[name].shape != shape
+                or not np.isfinite(document[name]).all()
+            ):
                 raise ValueError(f"{name} must be {shape} finite numbers")
         digest: Digest = from_plain(Digest, document)
     except (KeyError, TypeError, ValueError) as error:

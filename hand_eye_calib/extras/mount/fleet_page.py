@@ -65,7 +65,9 @@ def render_fleet(histories: Mapping[str, History]) -> str:
         History of each vehicle, by its name.
     """
     ordered = sorted(
-        histories.items(), key=lambda item: item[1].newest_event_ns, reverse=True
+        histories.items(),
+        key=lambda item: item[1].newest_event_ns,
+        reverse=True,
     )
     rows = [_row(name, history) for name, history in ordered]
     n_moved = sum(row.tone != "good" for row in rows)
@@ -79,7 +81,9 @@ def render_fleet(histories: Mapping[str, History]) -> str:
         else "No mount moved"
     )
     n_sessions = sum(row.n_sessions for row in rows)
-    sentence = f"{counted(len(rows), 'vehicle')}, {counted(n_sessions, 'session')}"
+    sentence = (
+        f"{counted(len(rows), 'vehicle')}, {counted(n_sessions, 'session')}"
+    )
     return page(
         Path(__file__).with_name("fleet_page.html"),
         "bad" if n_moved else "good",
@@ -88,7 +92,9 @@ def render_fleet(histories: Mapping[str, History]) -> str:
         rows=rows,
         vehicles=[
             (row, _change_rows(history), _precision(history), figure)
-            for row, (_, history), figure in zip(rows, ordered, figures, strict=False)
+            for row, (_, history), figure in zip(
+                rows, ordered, figures, strict=False
+            )
         ],
         n_without_figure=len(rows) - len(figures),
     )
@@ -106,7 +112,13 @@ def _row(name: str, history: History) -> _Row:
     alarms = [digest for digest in digests if digest.alarm]
     if alarms:
         return _Row(
-            name, "bad", "ALARM", alarms[-1].day, alarms[-1].alarm, len(digests), newest
+            name,
+            "bad",
+            "ALARM",
+            alarms[-1].day,
+            alarms[-1].alarm,
+            len(digests),
+            newest,
         )
     return _Row(name, "good", "NOT MOVED", "", "", len(digests), newest)
 
@@ -154,7 +166,9 @@ def _figure(history: History, number: int) -> Drawn:
     panels = figure.subplots(2, 3, sharex=True).ravel()
     days = _days([digest.start_ns for digest in history.digests])
     cuts = [changepoint.index for changepoint in history.changes]
-    alarms = [index for index, digest in enumerate(history.digests) if digest.alarm]
+    alarms = [
+        index for index, digest in enumerate(history.digests) if digest.alarm
+    ]
     for axis, panel in zip(AXES, panels, strict=True):
         _draw_axis(panel, axis, days, history.offsets, cuts)
         for index in cuts:
@@ -200,7 +214,10 @@ def _draw_axis(
             lw=0,
         )
         panel.plot(
-            days[part], values[part], color=PARENT, marker="." if len(part) == 1 else ""
+            days[part],
+            values[part],
+            color=PARENT,
+            marker="." if len(part) == 1 else "",
         )
     panel.tick_params(axis="y", colors=MUTED)
 

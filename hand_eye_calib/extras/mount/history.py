@@ -93,13 +93,16 @@ class History:
     @property
     def has_moved(self) -> bool:
         """Whether there is a change between sessions, or an alarm within one."""
-        return bool(self.changes) or any(digest.alarm for digest in self.digests)
+        return bool(self.changes) or any(
+            digest.alarm for digest in self.digests
+        )
 
     @property
     def newest_event_ns(self) -> int:
         """Start of the newest session with a change or an alarm (ns); 0 without any."""
         changed = [
-            self.digests[changepoint.index].start_ns for changepoint in self.changes
+            self.digests[changepoint.index].start_ns
+            for changepoint in self.changes
         ]
         alarmed = [digest.start_ns for digest in self.digests if digest.alarm]
         return max(changed + alarmed, default=0)
@@ -114,7 +117,9 @@ class History:
         if self.changes:
             newest = self.changes[-1]
             day = self.digests[newest.index].day
-            return f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
+            return (
+                f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
+            )
         if alarms:
             # The monitor compares within a session, where the sessions as a whole may agree.
             alarm = alarms[-1]
@@ -135,7 +140,9 @@ class History:
             "sessions": [digest.day for digest in self.digests],
             "changes": plain(rows),
             "alarms": {
-                digest.day: digest.alarm for digest in self.digests if digest.alarm
+                digest.day: digest.alarm
+                for digest in self.digests
+                if digest.alarm
             },
         }
 
@@ -147,7 +154,9 @@ def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:
     """
     if not digests:
         return []
-    tables = np.array([_evidence_on_common_offset(digest) for digest in digests])
+    tables = np.array(
+        [_evidence_on_common_offset(digest) for digest in digests]
+    )
     to_parent = se3.block_diagonal(se3.rotation_of(digests[0].installed))
     changes = _changes(tables, 0, digests[0].covariance, to_parent, cuts_from=0)
     return sorted(changes, key=lambda changepoint: changepoint.index)
@@ -202,7 +211,9 @@ def _changes(
         start + cut, float(ratios[best]), _shift_of(shifts[best], to_parent)
     )
     yield from _changes(tables[:cut], start, prior, to_parent, cuts_from)
-    yield from _changes(tables[cut:], start + cut, _UNKNOWN, to_parent, cuts_from=1)
+    yield from _changes(
+        tables[cut:], start + cut, _UNKNOWN, to_parent, cuts_from=1
+    )
 
 
 def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
@@ -210,4 +221,6 @@ def _shift_of(table: FloatArray, to_parent: FloatArray) -> change.Moved:
     prior = inverse(moved.shift_covariance(1.0, 1.0))
     covariance = np.linalg.inv(information(table) + prior)
     values = to_parent @ covariance @ score(table)
-    return change.moved(values, to_parent @ covariance @ to_parent.T, np.zeros(6))
+    return change.moved(
+        values, to_parent @ covariance @ to_parent.T, np.zeros(6)
+    )

@@ -21,7 +21,11 @@ from hand_eye_calib.online.live.state import Level, MountState, Outcome, by_axis
 # Limits of a session that is monitored but not calibrated: poses are paired soon, and few poses are
 # stored.
 LIMITS = BufferLimits(
-    capacity=4_000, pairing_starts=32, batch=64, batch_every=16, late_ns=500_000_000
+    capacity=4_000,
+    pairing_starts=32,
+    batch=64,
+    batch_every=16,
+    late_ns=500_000_000,
 )
 
 
@@ -68,7 +72,9 @@ class MountWatch:
         # The frames are known from the first pair on.
         if self._monitor is None and len(pairs):
             snapshot = calibrator.snapshot()
-            installed = self._installed(snapshot.parent_frame, snapshot.child_frame)
+            installed = self._installed(
+                snapshot.parent_frame, snapshot.child_frame
+            )
             if installed is not None:
                 self._frames = snapshot.parent_frame, snapshot.child_frame
                 self._monitor = MountMonitor(
@@ -83,7 +89,10 @@ class MountWatch:
         """Write the digest; return whether this succeeded, and a line about it for the user."""
         digest = self._monitor.digest(*self._frames) if self._monitor else None
         if digest is None:
-            return False, "no digest of the mount yet: the noise is being learned"
+            return (
+                False,
+                "no digest of the mount yet: the noise is being learned",
+            )
         try:
             path = write_digest(directory, digest)
         except OSError as error:
@@ -110,7 +119,9 @@ class MountWatch:
         else:
             text = "the mount has not moved"
             # Axes along which only large shifts would be detected.
-            limits = SEEN_TARGETS * np.array(self._session.calibrator.config.targets)
+            limits = SEEN_TARGETS * np.array(
+                self._session.calibrator.config.targets
+            )
             axes = [AXES[index] for index in np.flatnonzero(visible > limits)]
             if axes:
                 text += f"; {axes_in_words(axes)} cannot be monitored with this motion"
@@ -121,8 +132,12 @@ class MountWatch:
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift={AXIS_KEYS[axis]: row.difference for axis, row in shift.items()},
-            shift_sigma={AXIS_KEYS[axis]: row.sigma for axis, row in shift.items()},
+            shift={
+                AXIS_KEYS[axis]: row.difference for axis, row in shift.items()
+            },
+            shift_sigma={
+                AXIS_KEYS[axis]: row.sigma for axis, row in shift.items()
+            },
             visible_10min=by_axis(visible),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,

@@ -107,7 +107,9 @@ TUNING = Tuning()
 
 # Tested times since a shift (s).
 _LAGS = (
-    np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags).round().astype(int)
+    np.geomspace(TUNING.shortest_s, TUNING.memory_s, TUNING.lags)
+    .round()
+    .astype(int)
 )
 _SECOND_NS = 1_000_000_000
 
@@ -195,7 +197,9 @@ class MountMonitor:
         Long-run variance f of the scores, relative to their variance without correlation in time.
     """
 
-    def __init__(self, T_parent_child: FloatArray, covariance: FloatArray) -> None:
+    def __init__(
+        self, T_parent_child: FloatArray, covariance: FloatArray
+    ) -> None:
         self._installed = np.asarray(T_parent_child, dtype=float)
         self._covariance = TUNING.covariance_factor * np.asarray(
             covariance, dtype=float
@@ -274,11 +278,15 @@ class MountMonitor:
         i = np.flatnonzero(
             has_end & (seconds < incomplete_s) & (seconds > self._last_s)
         )
-        i = i[stamps_ns[j[i]] - stamps_ns[i] <= TUNING.max_motion_s * _SECOND_NS]
+        i = i[
+            stamps_ns[j[i]] - stamps_ns[i] <= TUNING.max_motion_s * _SECOND_NS
+        ]
         self._last_s = max(self._last_s, incomplete_s - 1)
         pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
         second_of_pair = seconds[i]
-        residuals, jacobians = moved.residuals_and_jacobians(pairs, self._installed)
+        residuals, jacobians = moved.residuals_and_jacobians(
+            pairs, self._installed
+        )
         # Column for the logarithm of the child's scale, which changes only the translation.
         by_scale = -se3.inverse(pairs.Ts_childi_childj)[:, :3, 3:]
         jacobians = np.append(
@@ -308,19 +316,27 @@ class MountMonitor:
         index = np.arange(len(pairs))
         pairs = replace(pairs, i=index, j=index + 1)
         residuals = np.concatenate([item.residuals for item in seconds])
-        jacobians = np.concatenate([item.jacobians[:, :, :6] for item in seconds])
+        jacobians = np.concatenate(
+            [item.jacobians[:, :, :6] for item in seconds]
+        )
         self.is_learning = False
         self._noise, _ = moved.noise_covariance(residuals)
         for _ in range(2):
             table, _ = _evidence(residuals, jacobians, self._noise)
             shift = moved.most_likely(table, TUNING.ridge)
-            self._noise, _ = moved.noise_covariance(residuals + jacobians @ shift)
+            self._noise, _ = moved.noise_covariance(
+                residuals + jacobians @ shift
+            )
         distances_m = np.linalg.norm(
             se3.translation_of(pairs.Ts_parenti_parentj), axis=1
         )
         speed_m_s = float(np.median(distances_m))
-        floor = floor_of_pairs(pairs, np.ones(len(pairs)), self._installed, speed_m_s)
-        floor += moved.shift_covariance(1e-3, 1e-4)  # keeps the covariance regular
+        floor = floor_of_pairs(
+            pairs, np.ones(len(pairs)), self._installed, speed_m_s
+        )
+        floor += moved.shift_covariance(
+            1e-3, 1e-4
+        )  # keeps the covariance regular
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
         for item in seconds:
@@ -387,10 +403,14 @@ class MountMonitor:
             return
         H = information(tables[best])
         S = score(tables[best])
-        covariance = np.linalg.inv(H + np.linalg.inv(moved.shift_covariance(1.0, 1.0)))
+        covariance = np.linalg.inv(
+            H + np.linalg.inv(moved.shift_covariance(1.0, 1.0))
+        )
         to_parent = se3.block_diagonal(se3.rotation_of(self._installed))
         values = to_parent @ covariance @ S
-        shift = change.moved(values, to_parent @ covariance @ to_parent.T, np.zeros(6))
+        shift = change.moved(
+            values, to_parent @ covariance @ to_parent.T, np.zeros(6)
+        )
         log_ratio = float(ratios[best])
         if self.alarm:
             self.alarm = replace(self.alarm, shift=shift, log_ratio=log_ratio)
@@ -419,7 +439,8 @@ class MountMonitor:
         lags = _LAGS[: np.searchsorted(_LAGS, n_seconds, side="right")]
         since = self._seconds.since(n_seconds - lags)
         since = (
-            np.concatenate([since, [self._old + self._seconds.total]]) / self.long_run
+            np.concatenate([since, [self._old + self._seconds.total]])
+            / self.long_run
         )
         before = since[-1] - since
         covariances = inverse(inverse(self._covariance) + information(before))
@@ -456,7 +477,8 @@ class MountMonitor:
         H = information(self._seconds.total)
         before = (information(self._old) + H) / self.long_run
         cov_before = (
-            np.linalg.inv(np.linalg.inv(self._covariance) + before) + self._wander
+            np.linalg.inv(np.linalg.inv(self._covariance) + before)
+            + self._wander
         )
         H = H / len(self._stamps_ns)
         # Subtract the spurious information on the translation that rotation noise produces:
@@ -464,7 +486,11 @@ class MountMonitor:
         generators = se3.skew(np.eye(3))
         precision = np.linalg.inv(self._noise)[:3, :3]
         spurious = np.einsum(
-            "jk,jai,ab,kbl->il", self._noise[3:, 3:], generators, precision, generators
+            "jk,jai,ab,kbl->il",
+            self._noise[3:, 3:],
+            generators,
+            precision,
+            generators,
         )
         H[:3, :3] -= self._motions_per_s * spurious
         H *= seconds / self.long_run
@@ -478,7 +504,8 @@ class MountMonitor:
         volumes = np.eye(6) + KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = (
-            np.sqrt(2.0 * TUNING.threshold + log_volumes) + NINE_TIMES_OUT_OF_TEN
+            np.sqrt(2.0 * TUNING.threshold + log_volumes)
+            + NINE_TIMES_OUT_OF_TEN
         )
         sigmas = sigmas_in_parent(se3.rotation_of(self._installed), covariance)
         return np.repeat(detected_sigmas, 3) * sigmas
@@ -490,7 +517,9 @@ def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
     angle_rad = np.median(se3.rotation_angle(se3.rotation_of(parent)))
     distance_m = np.median(np.linalg.norm(se3.translation_of(parent), axis=1))
     noise_rad = float(np.sqrt(np.trace(noise[3:, 3:]) / 3))
-    min_rad = max(TUNING.min_rotation_rad, TUNING.min_rotation_per_noise * noise_rad)
+    min_rad = max(
+        TUNING.min_rotation_rad, TUNING.min_rotation_per_noise * noise_rad
+    )
     return bool(angle_rad > min_rad or distance_m > TUNING.min_motion_m)
 
 

@@ -91,7 +91,9 @@ class Split(NamedTuple):
         """Return the values (N, ...) of all samples in windows, (W, K, ...)."""
         n_windows = len(self.is_enough)
         whole = values[: n_windows * self.size]
-        return whole.reshape(n_windows, self.size, *values.shape[1:])[self.is_enough]
+        return whole.reshape(n_windows, self.size, *values.shape[1:])[
+            self.is_enough
+        ]
 
 
 def split(
@@ -201,7 +203,9 @@ class Fit:
     def explained_share(self) -> float:
         """Share of the sum of squared residuals by which the faults reduce it."""
         without_faults = self._cost(self._extrinsic_columns)
-        return 1.0 - self._cost(self._every_column) / max(without_faults, 1e-300)
+        return 1.0 - self._cost(self._every_column) / max(
+            without_faults, 1e-300
+        )
 
     def _cost(self, columns: list[int]) -> float:
         """Return the sum of squared residuals after a fit of some columns."""
@@ -260,7 +264,9 @@ def fit_columns(
     for name, column in columns.items():
         table = column.rows(windows)
         tables.append(table)
-        instruments.append(column.instrument(windows) if column.instrument else table)
+        instruments.append(
+            column.instrument(windows) if column.instrument else table
+        )
         start = len(information)
         information += [column.sigma**-2] * table.shape[3]
         places[name] = list(range(start, len(information)))
@@ -276,7 +282,9 @@ def fit_columns(
     probes = probes - basis @ (to_basis @ probes)
     products = np.einsum("wkp,wkq->wpq", probes, data)
     counts = 3.0 * is_used.sum(axis=1)
-    weights, usual = _window_weights(products, next(iter(places.values())), counts)
+    weights, usual = _window_weights(
+        products, next(iter(places.values())), counts
+    )
     blocks = Blocks(weights[:, None, None] * products)
     blocks = blocks.merged(min(len(products), _MAX_BLOCKS))
     with_prior = Blocks(blocks.sums + prior / len(blocks.sums))
@@ -323,7 +331,9 @@ def _window_weights(
         x = np.append(-total.solve(extrinsic), 1.0)
         squares = np.einsum("i,wij,j->w", x, of_extrinsic, x) / counts
         usual = max(median(squares), 1e-18)
-        weights = robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
+        weights = (
+            robust_weights("cauchy", squares / usual / _HALF_WEIGHT**2) / usual
+        )
     return weights, usual
 
 

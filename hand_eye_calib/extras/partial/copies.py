@@ -17,7 +17,11 @@ def copied(evidence: str, **residual: Any) -> list[Finding]:
     """
     return [
         finding(
-            "not_independent", "both", Severity.ERROR, evidence=evidence, **residual
+            "not_independent",
+            "both",
+            Severity.ERROR,
+            evidence=evidence,
+            **residual,
         )
     ]
 

@@ -21,7 +21,11 @@ from hand_eye_calib.core.checks.findings import (
     unobservable_axes,
 )
 from hand_eye_calib.core.engine.kinds import Kind, kind_of
-from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, UNASKED_S, Snapshot
+from hand_eye_calib.core.engine.snapshot import (
+    MOST_MOVED_S,
+    UNASKED_S,
+    Snapshot,
+)
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial import position_checks, rotation_checks
@@ -64,7 +68,9 @@ _TRIED_OFFSETS_S = tuple(np.round(np.arange(-0.9, 0.95, 0.1), 3).tolist())
 _CLEAR_SHARE = 0.5
 
 
-def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
+def _solve_positions(
+    snapshot: Snapshot, cross_check: bool | None
+) -> Calibration:
     """Estimate the lever arm. ``cross_check`` has no effect: positions have no cross-check.
 
     A delay may make positions look unrelated to the poses. The correlation of speeds, or the paths
@@ -72,7 +78,11 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
     """
     result = _solve(snapshot, estimate_lever_arm)
     config = snapshot.config
-    if not _is_unrelated(result) or len(snapshot.kept) or "time_offset" in config.given:
+    if (
+        not _is_unrelated(result)
+        or len(snapshot.kept)
+        or "time_offset" in config.given
+    ):
         return result
     known_s = float(config.time_offset)
     parent, child = snapshot.streams
@@ -80,7 +90,9 @@ def _solve_positions(snapshot: Snapshot, cross_check: bool | None) -> Calibratio
         parent, child.shifted(known_s), config.max_gap, of_speed=True
     )
     offset_s = (
-        correlation.offset_s if correlation.is_clear else _offset_of_paths(snapshot)
+        correlation.offset_s
+        if correlation.is_clear
+        else _offset_of_paths(snapshot)
     )
     if not MOST_MOVED_S < abs(offset_s) < UNASKED_S:
         return result
@@ -92,7 +104,8 @@ def _shifted(snapshot: Snapshot, offset_s: float) -> Snapshot:
     """Return the snapshot with a time offset (s) in addition to that of its options."""
     known_s = float(snapshot.config.time_offset)
     return replace(
-        snapshot, config=replace(snapshot.config, time_offset=known_s + offset_s)
+        snapshot,
+        config=replace(snapshot.config, time_offset=known_s + offset_s),
     )
 
 
@@ -119,14 +132,19 @@ def _is_unrelated(calibration: Calibration) -> bool:
     return any(found.code == "unrelated" for found in calibration.findings)
 
 
-def _solve_rotations(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
+def _solve_rotations(
+    snapshot: Snapshot, cross_check: bool | None
+) -> Calibration:
     """Estimate the rotation, and the bias of angular rates."""
     return _solve(
-        snapshot, partial(estimate_rotation, cross_check=cross_check is not False)
+        snapshot,
+        partial(estimate_rotation, cross_check=cross_check is not False),
     )
 
 
-def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibration:
+def _solve(
+    snapshot: Snapshot, estimate: Callable[..., Calibration]
+) -> Calibration:
     """Estimate the extrinsic; pair the streams anew and repeat if the time offset is large.
 
     An estimated time offset that changes by more than ``UNASKED_S`` is rejected.
@@ -144,11 +162,15 @@ def _solve(snapshot: Snapshot, estimate: Callable[..., Calibration]) -> Calibrat
     config = replace(config, time_offset=result.time_offset_s)
     pose_pairs = replace(snapshot, config=config).pose_pairs
     return (
-        estimate(pose_pairs, config) if len(pose_pairs) >= config.min_pairs else result
+        estimate(pose_pairs, config)
+        if len(pose_pairs) >= config.min_pairs
+        else result
     )
 
 
-def check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+def check(
+    snapshot: Snapshot, calibration: Calibration | None = None
+) -> CheckResult:
     """Check two streams without full poses of both sensors.
 
     The returned findings include those of the calibration.
@@ -223,7 +245,9 @@ def _check_aligned(
     scale = calibration.scale if calibration else snapshot.config.given_scale
     aligned = child.scaled(scale).shifted(known_s)
     lever_arm_m = _least_lever_arm(calibration) if calibration else 0.0
-    return checking.check_parts(parent, aligned, snapshot.config.max_gap, lever_arm_m)
+    return checking.check_parts(
+        parent, aligned, snapshot.config.max_gap, lever_arm_m
+    )
 
 
 def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
@@ -252,7 +276,10 @@ def _check_clock(
     correlation = correlate_rates(
         parent, child.shifted(known_s), max_gap_s, uses_speeds
     )
-    if not correlation.is_clear or abs(correlation.offset_s) < _FOUND_BY_SOLVE_S:
+    if (
+        not correlation.is_clear
+        or abs(correlation.offset_s) < _FOUND_BY_SOLVE_S
+    ):
         return []
     sigma_s = _COARSE_INTERVALS * max(parent.interval_s, child.interval_s)
     offset = TimeOffset(correlation.offset_s, sigma_s, correlation)

@@ -23,7 +23,12 @@ from hand_eye_calib.core.assessment.second_opinion import (
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding, graded
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    finding,
+    graded,
+)
 from hand_eye_calib.core.checks.units import in_other_units
 from hand_eye_calib.core.engine import estimation
 from hand_eye_calib.core.engine.cross_check import cross_checked
@@ -38,7 +43,10 @@ from hand_eye_calib.extras.partial import position_windows
 from hand_eye_calib.extras.partial import positions as of_positions
 from hand_eye_calib.extras.partial.position_columns import fit_positions
 from hand_eye_calib.extras.partial.rate_bias import RateBias
-from hand_eye_calib.extras.partial.rotation_checks import TURNING, measured_stream
+from hand_eye_calib.extras.partial.rotation_checks import (
+    TURNING,
+    measured_stream,
+)
 from hand_eye_calib.extras.partial.rotation_columns import fit_pairs
 
 # Share of the path of the positions that the poses do not explain: above this, a fault is searched.
@@ -86,10 +94,16 @@ class _Paths:
         child = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
         if config.child_measures == "positions":
             return cls(
-                pose_pairs.stamps_ns, parent, se3.translation_of(child), is_child=True
+                pose_pairs.stamps_ns,
+                parent,
+                se3.translation_of(child),
+                is_child=True,
             )
         return cls(
-            pose_pairs.stamps_ns, child, se3.translation_of(parent), is_child=False
+            pose_pairs.stamps_ns,
+            child,
+            se3.translation_of(parent),
+            is_child=False,
         )
 
     def solve(self, with_scale: bool) -> of_positions.LeverArmSolution:
@@ -98,7 +112,9 @@ class _Paths:
             self.stamps_ns, self.poses, self.positions, with_scale
         )
 
-    def unexplained_share(self, solution: of_positions.LeverArmSolution) -> float:
+    def unexplained_share(
+        self, solution: of_positions.LeverArmSolution
+    ) -> float:
         """Return the share of the path of the positions that a lever arm does not explain."""
         return position_windows.unexplained_share(
             self.poses, self.positions, solution.lever_arm, solution.scale
@@ -112,14 +128,18 @@ class _Paths:
         The second value is the covariance (3, 3), m^2, that possible faults add to the lever arm.
         """
         scaled = solution.scale * self.positions
-        fitted = fit_positions(self.stamps_ns, self.poses, scaled, solution.lever_arm)
+        fitted = fit_positions(
+            self.stamps_ns, self.poses, scaled, solution.lever_arm
+        )
         if fitted is None:
             return solution, np.zeros((3, 3))
         smoothing = fitted.smoothing
         by_response = solution.by_response
         # Smoothing c is a response of -c.
         lever_arm = solution.lever_arm - smoothing.mean_s2 * by_response
-        of_smoothing = smoothing.variance_s4 * np.outer(by_response, by_response)
+        of_smoothing = smoothing.variance_s4 * np.outer(
+            by_response, by_response
+        )
         return (
             replace(solution, lever_arm=lever_arm),
             fitted.open_covariance + of_smoothing,
@@ -136,7 +156,9 @@ def unexplained_path(pose_pairs: PosePairs, config: CalibratorConfig) -> float:
     return position_windows.unexplained_at_start(paths.poses, paths.positions)
 
 
-def estimate_lever_arm(pose_pairs: PosePairs, config: CalibratorConfig) -> Calibration:
+def estimate_lever_arm(
+    pose_pairs: PosePairs, config: CalibratorConfig
+) -> Calibration:
     """Solve and assess synchronised poses and positions.
 
     The result has no frame names. Its rotation is the identity, and unknown.
@@ -252,9 +274,13 @@ def _check_path(
     if share < _SUSPECT_PATH:
         if is_scale_given:
             return ()
-        return _check_scale(solution, solution.model.tuning.of_positions[3], paths)
+        return _check_scale(
+            solution, solution.model.tuning.of_positions[3], paths
+        )
     axes = fused.observability[:3]
-    is_observed = any(dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes)
+    is_observed = any(
+        dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes
+    )
     is_near = is_observed and share < _UNRELATED_PATH
     # Does a unit or a scale explain the path?
     with contextlib.suppress(np.linalg.LinAlgError):
@@ -302,7 +328,9 @@ def _check_scale(
     scale = 1.0 + excess
     if not paths.is_child:
         scale = 1.0 / max(scale, _LEAST_SCALE)
-    differs = graded("scale", "child", scale - 1.0, scale=scale, sigma=sigma * scale**2)
+    differs = graded(
+        "scale", "child", scale - 1.0, scale=scale, sigma=sigma * scale**2
+    )
     return (differs,) if differs else ()
 
 
@@ -330,7 +358,9 @@ def estimate_rotation(
     rotations = replace(pose_pairs, Ts_pw_p=Ts_pw_p, Ts_cw_c=Ts_cw_c)
     on_one_clock = rotations.child_shifted(solution.time_offset_s)
     of_model = covariance.assess_rotation(Ts_pw_p, solution)
-    opinions = second_opinions(Ts_pw_p, on_one_clock.Ts_cw_c, solution.T_parent_child)
+    opinions = second_opinions(
+        Ts_pw_p, on_one_clock.Ts_cw_c, solution.T_parent_child
+    )
     assessment = of_model
     if not findings:
         open_covariance = _open_covariance(
@@ -350,7 +380,9 @@ def estimate_rotation(
         opinions=opinions,
         excess=excess_covariance(of_model, opinions),
     )
-    floor = estimation.floor_of(solved, rotations, config) * np.repeat([0.0, 1.0], 3)
+    floor = estimation.floor_of(solved, rotations, config) * np.repeat(
+        [0.0, 1.0], 3
+    )
     solved = replace(solved, floor=floor)
     checked = cross_checked(solved, config, rotations) if cross_check else None
     result = replace(checked or solved.calibration(), findings=findings)
@@ -385,18 +417,25 @@ def _rotations_of(Ts: FloatArray) -> FloatArray:
 
 
 def _solve_rotation(
-    stamps_ns: IntArray, Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, has_rates: bool
+    stamps_ns: IntArray,
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    has_rates: bool,
 ) -> tuple[adaptive_estimator.AdaptiveSolution, FloatArray]:
     """Estimate the rotation; return the solution, and the child's poses without a rate bias.
 
     The noise is fitted to increments of up to some seconds. Their change by a bias is linear only
     for a small bias, so a first solve removes most of it.
     """
-    solve = partial(adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True)
+    solve = partial(
+        adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True
+    )
     if not has_rates:
         return solve(Ts_cw_c, increments.SYSTEMATIC_OF_ROTATIONS), Ts_cw_c
     first = solve(Ts_cw_c, increments.SYSTEMATIC_OF_RATES, quick=True)
-    Ts_cw_c = increments.without_rate_bias(stamps_ns, Ts_cw_c, first.rate_bias[0])
+    Ts_cw_c = increments.without_rate_bias(
+        stamps_ns, Ts_cw_c, first.rate_bias[0]
+    )
     solution = solve(Ts_cw_c, increments.SYSTEMATIC_OF_RATES)
     parameters = solution.parameters.copy()
     parameters[increments.RATE] += first.parameters[increments.RATE]
@@ -421,7 +460,9 @@ def _rate_bias(
         of = "parent"
         bias = -rotation @ bias
         sigmas = np.sqrt(np.diag(rotation @ np.diag(sigmas**2) @ rotation.T))
-    return RateBias(of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist()))
+    return RateBias(
+        of=of, rad_per_s=tuple(bias.tolist()), sigma=tuple(sigmas.tolist())
+    )
 
 
 def _check_rotation(

@@ -14,7 +14,12 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import length
 from hand_eye_calib.core.checks import agreement
 from hand_eye_calib.core.checks.agreement import largest_deviation
-from hand_eye_calib.core.checks.findings import Finding, Severity, finding, graded
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    finding,
+    graded,
+)
 from hand_eye_calib.core.checks.sampling import check_interpolated
 from hand_eye_calib.core.checks.stream_pair import MIN_PAIRS
 from hand_eye_calib.core.geometry import se3
@@ -22,7 +27,10 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, synchronise
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.partial.copies import COPIED_SHARE, as_errors, copied
-from hand_eye_calib.extras.partial.position_columns import PositionFit, fit_positions
+from hand_eye_calib.extras.partial.position_columns import (
+    PositionFit,
+    fit_positions,
+)
 from hand_eye_calib.extras.partial.position_windows import unexplained_share
 from hand_eye_calib.extras.partial.positions import solve
 from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
@@ -87,14 +95,20 @@ def check_solved(
     list of Finding
     """
     child = child.shifted(calibration.time_offset_s)
-    pairs = synchronise(parent, child, config.max_gap).child_scaled(calibration.scale)
+    pairs = synchronise(parent, child, config.max_gap).child_scaled(
+        calibration.scale
+    )
     if len(pairs) < MIN_PAIRS:
         return []
     stream = "parent" if child.measures == "poses" else "child"
     priors = {*config.prior()}
     measured = {"parent": parent, "child": child}[stream]
-    interpolated = check_interpolated(se3.translation_of(measured.poses), stream)
-    return _check_moving(pairs, calibration, stream, priors, is_unrelated, interpolated)
+    interpolated = check_interpolated(
+        se3.translation_of(measured.poses), stream
+    )
+    return _check_moving(
+        pairs, calibration, stream, priors, is_unrelated, interpolated
+    )
 
 
 def _check_moving(
@@ -119,10 +133,14 @@ def _check_moving(
         poses = pairs.Ts_cw_c
         positions = se3.translation_of(pairs.Ts_pw_p)
         fitted = fit_positions(pairs.stamps_ns, poses, positions, -lever_arm)
-    no_lever_arm = [] if is_unrelated else check_position(lever_arm, sigmas, priors)
+    no_lever_arm = (
+        [] if is_unrelated else check_position(lever_arm, sigmas, priors)
+    )
     if fitted and _is_copied(fitted, positions):
         evidence = "The positions agree with the poses to rounding"
-        return as_errors(no_lever_arm) or copied(evidence, residual_m=fitted.residual)
+        return as_errors(no_lever_arm) or copied(
+            evidence, residual_m=fitted.residual
+        )
     if findings := [*interpolated, *no_lever_arm]:
         return findings
     if is_unrelated and _is_mirrored(pairs.stamps_ns, poses, positions):
@@ -132,7 +150,9 @@ def _check_moving(
     return check_positions(fitted, stream, is_unrelated)
 
 
-def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) -> bool:
+def _is_mirrored(
+    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray
+) -> bool:
     """Return whether a lever arm explains the positions after the sign of z is changed.
 
     The sign of any coordinate gives the same path up to a rotation, so z stands for all three.
@@ -142,7 +162,9 @@ def _is_mirrored(stamps_ns: IntArray, poses: FloatArray, positions: FloatArray) 
         solution = solve(stamps_ns, poses, mirrored)
     except np.linalg.LinAlgError:
         return False
-    share = unexplained_share(poses, mirrored, solution.lever_arm, solution.scale)
+    share = unexplained_share(
+        poses, mirrored, solution.lever_arm, solution.scale
+    )
     return share < _MAX_UNEXPLAINED_IF_MIRRORED
 
 
@@ -174,18 +196,30 @@ def check_position(
         return []
     lengths_m = np.abs(lever_arm[axes])
     sigmas_m = sigmas[axes]
-    if (lengths_m > np.maximum(_ZERO_M, agreement.ZERO_SIGMAS * sigmas_m)).any():
+    if (
+        lengths_m > np.maximum(_ZERO_M, agreement.ZERO_SIGMAS * sigmas_m)
+    ).any():
         return []
     uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
     if uppers_m[1] > _UNCERTAIN_M:
         return []
     # Two axes are not enough for an error: an antenna may be right above the other sensor.
-    is_sure = len(axes) == 3 and uppers_m[1] < _HOUSING_M and uppers_m[2] < _UNCERTAIN_M
+    is_sure = (
+        len(axes) == 3
+        and uppers_m[1] < _HOUSING_M
+        and uppers_m[2] < _UNCERTAIN_M
+    )
     severity = Severity.ERROR if is_sure else Severity.WARNING
     distance_m = float(np.linalg.norm(lengths_m))
     size = f"{length(distance_m)} +/- {length(float(sigmas_m.max()))}"
     return [
-        finding("no_lever_arm", "both", severity, size=size, translation_m=distance_m)
+        finding(
+            "no_lever_arm",
+            "both",
+            severity,
+            size=size,
+            translation_m=distance_m,
+        )
     ]
 
 

@@ -134,7 +134,9 @@ class PositionFit(Fit):
     def open_covariance(self) -> FloatArray:
         """Covariance (3, 3) that all possible faults but smoothing add to the lever arm."""
         of_smoothing = self.places["smoothing"]
-        others = [place for place in self._every_column if place not in of_smoothing]
+        others = [
+            place for place in self._every_column if place not in of_smoothing
+        ]
         return self.open_to(others)
 
 
@@ -172,7 +174,10 @@ def posterior_smoothing(
 
 
 def fit_positions(
-    stamps_ns: IntArray, poses: FloatArray, positions: FloatArray, lever_arm: FloatArray
+    stamps_ns: IntArray,
+    poses: FloatArray,
+    positions: FloatArray,
+    lever_arm: FloatArray,
 ) -> PositionFit | None:
     """Estimate a correction of the lever arm, and all faults, from measured positions.
 
@@ -202,7 +207,9 @@ def fit_positions(
     world = np.concatenate([translation, se3.skew(windows.path)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, windows.residuals, world)
     # Information of each column that no other column explains.
-    information = 1.0 / np.abs(np.diag(np.linalg.inv(fitted.blocks.total[:-1, :-1])))
+    information = 1.0 / np.abs(
+        np.diag(np.linalg.inv(fitted.blocks.total[:-1, :-1]))
+    )
     weight = fitted.weights @ is_used.sum(axis=1)
     return PositionFit(
         **vars(fitted),
@@ -233,8 +240,12 @@ def _windows(
     rotations = se3.rotation_of(poses)
     predicted = se3.times(rotations, lever_arm) + se3.translation_of(poses)
     around = stencil(stamps_s, step)
-    velocities, accelerations = path_derivatives(predicted, around, around.step_s)
-    _, measured_accelerations = path_derivatives(positions, around, around.step_s)
+    velocities, accelerations = path_derivatives(
+        predicted, around, around.step_s
+    )
+    _, measured_accelerations = path_derivatives(
+        positions, around, around.step_s
+    )
     in_windows = split(stamps_s, around.spans_s, step, _WINDOW_S)
     if in_windows is None:
         return None

@@ -61,14 +61,24 @@ def fit_windows(
         errors = np.sqrt(
             ((residuals - rotations @ lever_arm) ** 2).sum(axis=2).mean(axis=1)
         )
-        weights = robust_weights("cauchy", (errors / (np.median(errors) + 1e-12)) ** 2)
+        weights = robust_weights(
+            "cauchy", (errors / (np.median(errors) + 1e-12)) ** 2
+        )
         score = np.einsum("n,nkij,nki->j", weights, rotations, residuals)
         previous = lever_arm
-        lever_arm = np.linalg.solve(np.einsum("n,njl->jl", weights, information), score)
+        lever_arm = np.linalg.solve(
+            np.einsum("n,njl->jl", weights, information), score
+        )
         if np.abs(lever_arm - previous).max() < _START_SETTLED_M:
             break
-    window_of_pose = np.minimum(np.arange(len(positions)) // size, len(alignments) - 1)
-    return lever_arm, scale, alignments[window_of_pose] @ se3.rotation_of(Ts_pw_p)
+    window_of_pose = np.minimum(
+        np.arange(len(positions)) // size, len(alignments) - 1
+    )
+    return (
+        lever_arm,
+        scale,
+        alignments[window_of_pose] @ se3.rotation_of(Ts_pw_p),
+    )
 
 
 def unexplained_at_start(
@@ -84,7 +94,10 @@ def unexplained_at_start(
 
 
 def unexplained_share(
-    Ts_pw_p: FloatArray, positions: FloatArray, lever_arm: FloatArray, scale: float
+    Ts_pw_p: FloatArray,
+    positions: FloatArray,
+    lever_arm: FloatArray,
+    scale: float,
 ) -> float:
     """Return the share of the path of positions that poses and a lever arm do not explain.
 
@@ -103,7 +116,9 @@ def unexplained_share(
     float
         1 if nothing moves.
     """
-    predicted = se3.rotation_of(Ts_pw_p) @ lever_arm + se3.translation_of(Ts_pw_p)
+    predicted = se3.rotation_of(Ts_pw_p) @ lever_arm + se3.translation_of(
+        Ts_pw_p
+    )
     size = max(len(positions) // _PATH_PARTS, min(_PATH_PARTS, len(positions)))
     expected = _windows(predicted, size)
     measured = _windows(scale * positions, size)

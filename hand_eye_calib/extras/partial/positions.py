@@ -31,7 +31,10 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments, reml
-from hand_eye_calib.core.noise.estimator import MIN_REPORTED_SIGMAS, ModelSolution
+from hand_eye_calib.core.noise.estimator import (
+    MIN_REPORTED_SIGMAS,
+    ModelSolution,
+)
 from hand_eye_calib.core.noise.noise_model import (
     JITTER,
     MIN_VARIANCE,
@@ -94,9 +97,7 @@ class LeverArmSolution(ModelSolution):
         """Return the noise in numbers and in words."""
         sigmas = fast_sigmas(self.levels)
         white = length(sigmas.translation_m)
-        drift = (
-            f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
-        )
+        drift = f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
         sentences = [
             f"each position is off by {white} per axis, and the odometry drifts by {drift} from "
             "one to the next"
@@ -228,7 +229,9 @@ class _State:
             parameters=np.zeros(RESPONSE + 1),
             model=NoiseModel((), "sensors", interval_s, duration_s, tuning),
             levels=np.zeros(0),
-            outliers=Outliers(np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)),
+            outliers=Outliers(
+                np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=bool)
+            ),
             walk_factors=np.ones(n),
             imprecise=np.zeros(n + 1, dtype=bool),
             tuning=tuning,
@@ -240,12 +243,18 @@ class _State:
             0.5 * (squares[1:] + squares[:-1]),
             squares[-1:],
         ]
-        imprecise = _imprecise(np.concatenate(square_of_position), tuning, MIN_VARIANCE)
-        levels = rough_levels(residuals, imprecise[1:] | imprecise[:-1], tuning.jitter)
+        imprecise = _imprecise(
+            np.concatenate(square_of_position), tuning, MIN_VARIANCE
+        )
+        levels = rough_levels(
+            residuals, imprecise[1:] | imprecise[:-1], tuning.jitter
+        )
         levels[ROTATION] = _ANY_ROTATION
         levels[WALK_ROTATION] = tuning.rotation_walk[1]
         streams = bridge_outliers(streams, state.X, imprecise)
-        return replace(state, streams=streams, levels=levels, imprecise=imprecise)
+        return replace(
+            state, streams=streams, levels=levels, imprecise=imprecise
+        )
 
     @property
     def left_out(self) -> BoolArray:
@@ -270,20 +279,29 @@ class _State:
             path=increments.cumulative_sum(
                 se3.times(worlds, np.diff(course.path, axis=0))
             ),
-            along=increments.cumulative_sum(worlds @ np.diff(course.along, axis=0)),
+            along=increments.cumulative_sum(
+                worlds @ np.diff(course.along, axis=0)
+            ),
         )
 
     def linearised(self) -> increments.Linearisation:
         """Linearise increments between poses with respect to lever arm and parameters."""
         accelerations = _accelerations(self.streams, self.X, self.tuning)
         linearisation = increments.linearise(
-            self.streams, self.course, self.X, self.parameters[:RESPONSE], _SHARED
+            self.streams,
+            self.course,
+            self.X,
+            self.parameters[:RESPONSE],
+            _SHARED,
         )
         response = (
-            se3.times(linearisation.adjoints, accelerations[:-1]) - accelerations[1:]
+            se3.times(linearisation.adjoints, accelerations[:-1])
+            - accelerations[1:]
         )
         columns = np.insert(linearisation.columns, -1, response, axis=2)
-        return replace(linearisation, columns=np.delete(columns, [3, 4, 5], axis=2))
+        return replace(
+            linearisation, columns=np.delete(columns, [3, 4, 5], axis=2)
+        )
 
     def space(self, model: NoiseModel | None = None) -> StateSpace:
         """Return the state space of all poses.
@@ -339,7 +357,9 @@ class _State:
         """
         tuning = self.tuning
         prior = _level_prior(self.model, self.levels)
-        fit, _ = reml.fit(self.sampled_space(), self.levels, prior, tuning.settled_loss)
+        fit, _ = reml.fit(
+            self.sampled_space(), self.levels, prior, tuning.settled_loss
+        )
         best = replace(self, levels=fit.levels)
         loss = fit.loss - tuning.least_gain
         for kind in kinds:
@@ -363,10 +383,14 @@ class _State:
         of_walk, of_white = innovation_chi_squares(posterior, self.left_out)
         tuning = self.tuning
         outliers = detect_outliers(self.outliers, of_walk, of_white, tuning)
-        jump_factors = np.maximum(tuning.jump_factor * of_walk, self.walk_factors)
+        jump_factors = np.maximum(
+            tuning.jump_factor * of_walk, self.walk_factors
+        )
         errors = posterior.states_after(posterior.normal.step)[:, :3]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
-        path = se3.translation_of(Ts_cw_c) + se3.times(se3.rotation_of(Ts_cw_c), errors)
+        path = se3.translation_of(Ts_cw_c) + se3.times(
+            se3.rotation_of(Ts_cw_c), errors
+        )
         spread = posterior.factor.selected_inverse[0][:, range(3), range(3)]
         drift = 3.0 * float(np.exp(self.levels[WALK_TRANSLATION]))
         squares = ((self.positions - path) ** 2 + spread).sum(axis=1)
@@ -393,7 +417,9 @@ class _State:
         return replace(self, streams=streams, X=X, parameters=parameters)
 
 
-def _imprecise(squares: FloatArray, tuning: Tuning, drift_m2: float) -> BoolArray:
+def _imprecise(
+    squares: FloatArray, tuning: Tuning, drift_m2: float
+) -> BoolArray:
     """Detect positions (N,) whose neighbourhood is far less precise than the best quarter.
 
     Parameters
@@ -439,13 +465,19 @@ def _solution(
     sigmas = np.zeros(RESPONSE + 1)
     parameters = state.parameters.copy()
     sigmas[[*_SHARED, RESPONSE]] = np.sqrt(np.diag(covariance)[3:])
-    parameters[[*_SHARED, RESPONSE]] += np.r_[normal.step[3:], with_response.step[-1]]
+    parameters[[*_SHARED, RESPONSE]] += np.r_[
+        normal.step[3:], with_response.step[-1]
+    ]
     # An error that is correlated over part of the recording may also have a part that is constant
     # over all of it. X absorbs this part, so the variance of the error is added.
-    lasting = float(np.exp(state.levels[N_FAST])) if state.model.processes else 0.0
+    lasting = (
+        float(np.exp(state.levels[N_FAST])) if state.model.processes else 0.0
+    )
     return LeverArmSolution(
         lever_arm=se3.translation_of(state.X) + normal.step[:3],
-        covariance=covariance[:3, :3] + np.outer(shift, shift) + lasting * np.eye(3),
+        covariance=covariance[:3, :3]
+        + np.outer(shift, shift)
+        + lasting * np.eye(3),
         by_response=_by_response(posterior.products),
         parameters=parameters,
         parameter_sigmas=sigmas,
@@ -476,7 +508,9 @@ def _by_response(products: FloatArray) -> FloatArray:
     response = 3 + len(_SHARED)
     information = products[:response, :response]
     with_response = products[:response, response]
-    return np.asarray(-np.linalg.solve(information, with_response)[:3], dtype=float)
+    return np.asarray(
+        -np.linalg.solve(information, with_response)[:3], dtype=float
+    )
 
 
 def _accelerations(
@@ -504,5 +538,7 @@ def _accelerations(
     middle = slice(2 * k, -2 * k)
     to_body = np.swapaxes(streams.Ts_pw_p[middle, :3, :3], 1, 2)
     is_near = spans_s < tuning.longest_span_factor * 4 * k * interval_s
-    accelerations[middle, :3] = np.where(is_near, se3.times(to_body, in_world), 0.0)
+    accelerations[middle, :3] = np.where(
+        is_near, se3.times(to_body, in_world), 0.0
+    )
     return accelerations

@@ -191,7 +191,9 @@ def check_solved(
     if findings:
         return findings
     streams = streams._replace(pairs=_without_bias(pairs, calibration))
-    return _check_mount(streams.pairs, rotation) or _check_response(streams, rotation)
+    return _check_mount(streams.pairs, rotation) or _check_response(
+        streams, rotation
+    )
 
 
 def _check_reading(streams: _Streams) -> list[Finding]:
@@ -208,7 +210,8 @@ def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
     bias = np.array(rate_bias.rad_per_s)
     if rate_bias.of == "parent":
         return replace(
-            pairs, Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias)
+            pairs,
+            Ts_pw_p=without_rate_bias(pairs.stamps_ns, pairs.Ts_pw_p, bias),
         )
     return replace(
         pairs, Ts_cw_c=without_rate_bias(pairs.stamps_ns, pairs.Ts_cw_c, bias)
@@ -216,7 +219,10 @@ def _without_bias(pairs: PosePairs, calibration: Calibration) -> PosePairs:
 
 
 def check_rotation(
-    rotation: FloatArray, sigmas: FloatArray, priors: Collection[str], has_rates: bool
+    rotation: FloatArray,
+    sigmas: FloatArray,
+    priors: Collection[str],
+    has_rates: bool,
 ) -> list[Finding]:
     """Detect a rotation of zero, which suggests that both streams come from one sensor.
 
@@ -238,7 +244,8 @@ def check_rotation(
         return []
     angles_rad = np.abs(se3.rotation_log(rotation))
     if (
-        angles_rad > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)
+        angles_rad
+        > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)
     ).any():
         return []
     angle_rad = float(np.linalg.norm(angles_rad))
@@ -259,12 +266,15 @@ def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < MIN_PAIRS:
         return []
-    residual_rad = median(np.linalg.norm(of_child @ rotation.T - of_parent, axis=1))
+    residual_rad = median(
+        np.linalg.norm(of_child @ rotation.T - of_parent, axis=1)
+    )
     usual_rad = median(np.linalg.norm(of_parent, axis=1))
     if residual_rad > min(_COPIED_RAD, COPIED_SHARE * usual_rad):
         return []
     return copied(
-        "The rotations of both streams agree to rounding", residual_rad=residual_rad
+        "The rotations of both streams agree to rounding",
+        residual_rad=residual_rad,
     )
 
 
@@ -293,10 +303,17 @@ def _check_unit(streams: _Streams) -> list[Finding]:
     other = streams.parent if streams.name == "child" else streams.child
     ratio = _large_rate(streams.measured) / _large_rate(other)
     degrees = float(np.degrees(1.0))
-    if min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0)) >= _UNIT_WITHIN:
+    if (
+        min(abs(ratio / degrees - 1.0), abs(ratio * degrees - 1.0))
+        >= _UNIT_WITHIN
+    ):
         return []
     unit, read_as = ("deg/s", "rad/s") if ratio > 1.0 else ("rad/s", "deg/s")
-    return [finding("rate_unit", streams.name, ratio=ratio, unit=unit, read_as=read_as)]
+    return [
+        finding(
+            "rate_unit", streams.name, ratio=ratio, unit=unit, read_as=read_as
+        )
+    ]
 
 
 def _rates(stream: Trajectory) -> FloatArray:
@@ -362,7 +379,8 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
     by_rotation, by_mirror = residuals_rad
     usual = median(np.linalg.norm(of_parent, axis=1))
     is_mirrored = (
-        by_mirror < _MIRRORED * by_rotation and by_rotation > _UNMIRRORED * usual
+        by_mirror < _MIRRORED * by_rotation
+        and by_rotation > _UNMIRRORED * usual
     )
     return [finding("mirrored_rates", streams.name)] if is_mirrored else []
 
@@ -378,7 +396,9 @@ def _check_levels(streams: _Streams) -> list[Finding]:
             # The mean of two rates has half the steps.
             step_rad_s = 2.0 * median(steps)
             if step_rad_s > _STEP_RAD_S:
-                return [finding("coarse_rates", streams.name, step_rad_s=step_rad_s)]
+                return [
+                    finding("coarse_rates", streams.name, step_rad_s=step_rad_s)
+                ]
             continue
         sizes = np.abs(column)
         limit = sizes.max()
@@ -412,7 +432,9 @@ def _coarse_steps(values: FloatArray, rounding: float) -> FloatArray | None:
 def _check_coarse_orientations(streams: _Streams) -> list[Finding]:
     """Detect orientations whose roll, pitch or yaw is in coarse steps."""
     for name, stream in (("parent", streams.parent), ("child", streams.child)):
-        angles_deg = np.degrees(se3.rotation_to_rpy(se3.rotation_of(stream.poses)))
+        angles_deg = np.degrees(
+            se3.rotation_to_rpy(se3.rotation_of(stream.poses))
+        )
         for column in angles_deg.T:
             steps_deg = _coarse_steps(column, _ROUNDING_DEG)
             if steps_deg is None:
@@ -434,8 +456,14 @@ def _check_mount(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
         se3.from_rotation_translation(se3.rotation_of(pairs.Ts_pw_p), still),
         se3.from_rotation_translation(se3.rotation_of(pairs.Ts_cw_c), still),
     )
-    change = find_change(turning, se3.from_rotation_translation(rotation, still))
-    moved = agreement.moved_mount(change, int(pairs.stamps_ns[0])) if change else None
+    change = find_change(
+        turning, se3.from_rotation_translation(rotation, still)
+    )
+    moved = (
+        agreement.moved_mount(change, int(pairs.stamps_ns[0]))
+        if change
+        else None
+    )
     return [moved] if moved else []
 
 
@@ -456,10 +484,18 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
     of_kind = _shear if streams.has_rates else _main_gain
     suspects.append(of_kind(fitted, streams))
     findings = most_significant(suspects)
-    if findings or not streams.has_rates or fitted.bias_drift < _BIAS_DRIFT_RAD_S:
+    if (
+        findings
+        or not streams.has_rates
+        or fitted.bias_drift < _BIAS_DRIFT_RAD_S
+    ):
         return findings
     return [
-        finding("bias_drift", streams.name, deg_s=float(np.degrees(fitted.bias_drift)))
+        finding(
+            "bias_drift",
+            streams.name,
+            deg_s=float(np.degrees(fitted.bias_drift)),
+        )
     ]
 
 
@@ -477,7 +513,8 @@ def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
     part = "rates" if stream.measures == "rates" else "orientations"
     seconds = abs(smoothing_s2) ** 0.5
     return Suspect(
-        n_sigmas, finding("smoothed_rotations", name, part=part, smoothing_s=seconds)
+        n_sigmas,
+        finding("smoothed_rotations", name, part=part, smoothing_s=seconds),
     )
 
 
@@ -511,7 +548,8 @@ def _gain(fitted: RotationFit, streams: _Streams) -> Suspect:
     place, gain, sigma = largest
     values = {"axis": "xyz"[place], "gain": 1.0 + gain, "sigma": sigma}
     return Suspect(
-        abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values)
+        abs(gain) / sigma,
+        graded("gain_of_axis", streams.name, gain, sigma, **values),
     )
 
 
@@ -522,7 +560,8 @@ def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
         return Suspect(0.0, None)
     values = {"axis": "main", "gain": 1.0 + gain, "sigma": sigma}
     return Suspect(
-        abs(gain) / sigma, graded("gain_of_axis", streams.name, gain, sigma, **values)
+        abs(gain) / sigma,
+        graded("gain_of_axis", streams.name, gain, sigma, **values),
     )
 
 
@@ -535,5 +574,7 @@ def _shear(fitted: RotationFit, streams: _Streams) -> Suspect:
     first, second = ("xyz"[axis] for axis in PLANES[place])
     degrees = float(np.degrees(2.0 * abs(shear)))
     axes = f"{first} and {second}"
-    issue = graded("misaligned", streams.name, shear, sigma, axes=axes, degrees=degrees)
+    issue = graded(
+        "misaligned", streams.name, shear, sigma, axes=axes, degrees=degrees
+    )
     return Suspect(abs(shear) / sigma, issue)

@@ -35,9 +35,18 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.agreement import BIASES
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.differences import Stencil, rotations_around, stencil
+from hand_eye_calib.core.geometry.differences import (
+    Stencil,
+    rotations_around,
+    stencil,
+)
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
-from hand_eye_calib.extras.partial.columns import Column, Fit, fit_columns, split
+from hand_eye_calib.extras.partial.columns import (
+    Column,
+    Fit,
+    fit_columns,
+    split,
+)
 
 # Duration of a window (s): long enough for turns, short enough for a constant bias.
 _WINDOW_S = 20.0
@@ -149,7 +158,9 @@ class RotationFit(Fit):
         weak: list[int] = []
         prior_sigmas: list[float] = []
         for name in ("gains", "shears"):
-            is_weak = np.abs(self.estimate(name).values) <= BIASES * self.biases(name)
+            is_weak = np.abs(
+                self.estimate(name).values
+            ) <= BIASES * self.biases(name)
             places = np.array(self.places[name])[is_weak]
             weak += places.tolist()
             prior_sigmas += [_COLUMNS[name].sigma] * len(places)
@@ -190,7 +201,9 @@ class RotationFit(Fit):
         The bias of a part is the mean of its windows, because noise differs from window to window.
         """
         biases = self.nuisances[:, 3:]
-        of_parts = [part.mean(axis=0) for part in np.array_split(biases, _PARTS)]
+        of_parts = [
+            part.mean(axis=0) for part in np.array_split(biases, _PARTS)
+        ]
         return float(np.std(of_parts, axis=0).max())
 
 
@@ -213,12 +226,19 @@ def fit_pairs(
     of_parent = se3.rotation_of(pairs.Ts_pw_p)
     of_child = se3.rotation_of(pairs.Ts_cw_c)
     if stream == "child":
-        return fit_rotations(pairs.stamps_ns, of_parent @ rotation, of_child, has_rates)
-    return fit_rotations(pairs.stamps_ns, of_child @ rotation.T, of_parent, has_rates)
+        return fit_rotations(
+            pairs.stamps_ns, of_parent @ rotation, of_child, has_rates
+        )
+    return fit_rotations(
+        pairs.stamps_ns, of_child @ rotation.T, of_parent, has_rates
+    )
 
 
 def fit_rotations(
-    stamps_ns: IntArray, reference: FloatArray, measured: FloatArray, has_rates: bool
+    stamps_ns: IntArray,
+    reference: FloatArray,
+    measured: FloatArray,
+    has_rates: bool,
 ) -> RotationFit | None:
     """Fit rotations with the extrinsic rotation and all faults.
 
@@ -247,11 +267,15 @@ def fit_rotations(
     is_used = in_windows.is_used
     # Errors in the world of the reference, about the mean of each window.
     between = in_windows(measured) @ np.swapaxes(in_windows(reference), 2, 3)
-    worlds = se3.nearest_rotation((between * is_used[..., None, None]).sum(axis=1))
+    worlds = se3.nearest_rotation(
+        (between * is_used[..., None, None]).sum(axis=1)
+    )
     errors = se3.rotation_log(np.swapaxes(worlds, 1, 2)[:, None] @ between)
     orientations = in_windows(reference)
     moving = np.broadcast_to(np.eye(3), orientations.shape)
-    drifting = _integral(stamps_s, reference[:-1] if has_rates else moving[0, :1])
+    drifting = _integral(
+        stamps_s, reference[:-1] if has_rates else moving[0, :1]
+    )
     motions = []
     for stream in (reference, measured):
         whole = _motion(stamps_s, stream, reference, around, has_rates)
@@ -307,7 +331,8 @@ def _motion(
     shears = np.zeros_like(halfway)
     for column, (k, m) in enumerate(PLANES):
         shears[..., column] = (
-            halfway[..., k] * steps[:, m, None] + halfway[..., m] * steps[:, k, None]
+            halfway[..., k] * steps[:, m, None]
+            + halfway[..., m] * steps[:, k, None]
         )
     return _Motion(
         rates=se3.times(orientations, rates),

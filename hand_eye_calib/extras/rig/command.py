@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from hand_eye_calib.formats.remote import RestoreUrls
 
 
-def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") -> int:
+def calibrate_rig(
+    arguments: argparse.Namespace, restore_urls: "RestoreUrls"
+) -> int:
     """Calibrate a rig, print it, and save it if ``--out`` is set; return the exit code.
 
     The arguments name a trajectory file for each sensor, or topics of bags. ``restore_urls``
@@ -45,9 +47,13 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
         raise ConfigError(
             "--installed and --base-frame apply to two sensors, not to a rig"
         )
-    readings = _read_topics(arguments) if arguments.topics else _read_files(arguments)
+    readings = (
+        _read_topics(arguments) if arguments.topics else _read_files(arguments)
+    )
     sensors = _by_frame(readings)
-    inputs = restore_urls(readings.inputs) | {"options": options_from(arguments)}
+    inputs = restore_urls(readings.inputs) | {
+        "options": options_from(arguments)
+    }
     if arguments.label:
         inputs["labels"] = dict(arguments.label)
     snapshots: dict[str, Snapshot] = {}
@@ -68,7 +74,9 @@ def calibrate_rig(arguments: argparse.Namespace, restore_urls: "RestoreUrls") ->
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
-            write_rig_report(arguments.out, rig, readings.names, snapshots=snapshots)
+            write_rig_report(
+                arguments.out, rig, readings.names, snapshots=snapshots
+            )
     return end(rig.calibrations)
 
 
@@ -129,13 +137,17 @@ def _read_files(arguments: argparse.Namespace) -> _Readings:
     names = [*map(str, arguments.paths)]
     files = read_files(arguments, arguments.paths, {})
     note(*files.repairs)
-    return _Readings(files.trajectories, names, {"files": names}, files.warnings)
+    return _Readings(
+        files.trajectories, names, {"files": names}, files.warnings
+    )
 
 
 def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
     """Return the trajectories by the frames of their sensors; a ConfigError if frames are equal."""
     sensors: dict[str, Trajectory] = {}
-    for trajectory, name in zip(readings.trajectories, readings.names, strict=True):
+    for trajectory, name in zip(
+        readings.trajectories, readings.names, strict=True
+    ):
         frame = trajectory.sensor_frame or name
         if frame in sensors:
             raise ConfigError(
@@ -159,7 +171,9 @@ def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
             *others,
         ]
         transform = transforms_of(calibration)["T_parent_child"]
-        lines += transform_lines(transform, calibration.out_of_reach, with_details)
+        lines += transform_lines(
+            transform, calibration.out_of_reach, with_details
+        )
         lines += allowance_lines(calibration)
         lines += [f"  {line}" for line in publish_lines(calibration)]
         if with_details:

@@ -58,7 +58,9 @@ def render_rig(
         rig=rig,
         inputs=inputs,
         poses=[
-            printed_numbers(transforms_of(calibration)["T_parent_child"], (), "±")
+            printed_numbers(
+                transforms_of(calibration)["T_parent_child"], (), "±"
+            )
             for calibration in rig.calibrations
         ],
         figures=figures,
@@ -89,7 +91,9 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
     }
     for name, other in session.others.items():
         frame = other.child_frame
-        sensors[name if frame in {*sensors, _NAMELESS} else frame] = other.streams[1]
+        sensors[name if frame in {*sensors, _NAMELESS} else frame] = (
+            other.streams[1]
+        )
     options = config.to_options()
     rig = calibrate_rig(sensors, {name: options[name] for name in names})
     inputs = {**session.inputs, "sensors": list(rig.sensors)}

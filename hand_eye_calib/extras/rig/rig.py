@@ -18,7 +18,11 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
-from hand_eye_calib.core.base.errors import ConfigError, InputError, require_type
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    InputError,
+    require_type,
+)
 from hand_eye_calib.core.base.plain import Document, plain
 from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.base.text import angle, frame_name, length, listing
@@ -112,9 +116,14 @@ def calibrated(
     max_gap_s = attempts[0].snapshot.config.max_gap
     neighbours = [
         _between(parent, child, calibration.method, max_gap_s)
-        for calibration, parent, child in zip(star, aligned, aligned[1:], strict=False)
+        for calibration, parent, child in zip(
+            star, aligned, aligned[1:], strict=False
+        )
     ]
-    sensors = (first.sensor_frame, *(calibration.child_frame for calibration in star))
+    sensors = (
+        first.sensor_frame,
+        *(calibration.child_frame for calibration in star),
+    )
     star = _with_copies(star, others, aligned, max_gap_s)
     return RigCalibration.of(sensors, star, neighbours)
 
@@ -150,7 +159,10 @@ def _with_copies(
             are_exact=False,
         )
         for found in copied:
-            names = {"first": star[i].child_frame, "second": star[k].child_frame}
+            names = {
+                "first": star[i].child_frame,
+                "second": star[k].child_frame,
+            }
             named = replace(
                 found, key="copied_in_rig", values={**found.values, **names}
             )
@@ -168,7 +180,9 @@ def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
     """
     config = attempt.snapshot.config
     calibration = attempt.calibration
-    poses = se3.put_right(child.poses, config.child_invert, config.child_quaternion)
+    poses = se3.put_right(
+        child.poses, config.child_invert, config.child_quaternion
+    )
     child = replace(child, poses=poses, sensor_frame=calibration.child_frame)
     return child.scaled(calibration.scale).shifted(calibration.time_offset_s)
 
@@ -181,7 +195,9 @@ def _between(
     config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
     calibration = solve_poses(pairs, config).calibration()
     return replace(
-        calibration, parent_frame=parent.sensor_frame, child_frame=child.sensor_frame
+        calibration,
+        parent_frame=parent.sensor_frame,
+        child_frame=child.sensor_frame,
     )
 
 
@@ -205,7 +221,9 @@ def _require_rig(
             )
     for name, value in options.items():
         if name.startswith(_OF_ONE_PAIR):
-            raise ConfigError(f"{name} applies to two sensors; omit it for a rig")
+            raise ConfigError(
+                f"{name} applies to two sensors; omit it for a rig"
+            )
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(
                 f"{name} {value} applies to two sensors; for a rig, set {name} estimate, or "
@@ -327,7 +345,8 @@ class RigCalibration:
         rig = cls(sensors, tuple(star), tuple(neighbours), closures)
         calibrations = tuple(
             replace(
-                calibration, T_parent_child=se3.exp(step) @ calibration.T_parent_child
+                calibration,
+                T_parent_child=se3.exp(step) @ calibration.T_parent_child,
             )
             for calibration, step in zip(star, rig._steps(), strict=True)
         )
@@ -355,14 +374,22 @@ class RigCalibration:
     @property
     def headline(self) -> str:
         """The verdict; if the sensors differ, each verdict with its sensors, the gravest first."""
-        of_verdict: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+        of_verdict: dict[Verdict, list[str]] = {
+            verdict: [] for verdict in Verdict
+        }
         for result in self.calibrations:
             of_verdict[result.verdict].append(result.child_frame)
-        groups = [(verdict, of_verdict[verdict]) for verdict in reversed(Verdict)]
-        texts = [f"{verdict.value}: {listing(of)}" for verdict, of in groups if of]
+        groups = [
+            (verdict, of_verdict[verdict]) for verdict in reversed(Verdict)
+        ]
+        texts = [
+            f"{verdict.value}: {listing(of)}" for verdict, of in groups if of
+        ]
         if len(texts) == 1:
             return f"{self.verdict.value}: {len(self.sensors)} sensors"
-        return f"{texts[0]} of {len(self.sensors)} sensors; {'; '.join(texts[1:])}"
+        return (
+            f"{texts[0]} of {len(self.sensors)} sensors; {'; '.join(texts[1:])}"
+        )
 
     def __repr__(self) -> str:
         return self.headline
@@ -402,7 +429,9 @@ class RigCalibration:
         for k, neighbour in enumerate(self.neighbours):
             parent = self.Xs[k + 1]
             child = self.Xs[k + 2]
-            error = se3.log(parent @ neighbour.T_parent_child @ se3.inverse(child))
+            error = se3.log(
+                parent @ neighbour.T_parent_child @ se3.inverse(child)
+            )
             weight = np.linalg.inv(_in_first(neighbour, child))
             for row, sign in ((k + 1, 1.0), (k, -1.0)):
                 s[row] += sign * weight @ error
@@ -431,7 +460,9 @@ class RigCalibration:
         """Return :meth:`covariance` without the allowance."""
         return self._covariance(first, second, with_allowance=False)
 
-    def _covariance(self, first: str, second: str, with_allowance: bool) -> FloatArray:
+    def _covariance(
+        self, first: str, second: str, with_allowance: bool
+    ) -> FloatArray:
         """Return :meth:`covariance`, with or without the allowance."""
         numbers = [self.sensors.index(first), self.sensors.index(second)]
         low, high = sorted(numbers)
@@ -442,7 +473,9 @@ class RigCalibration:
             results = [(self.neighbours[low - 1], self.Xs[high])]
         else:
             results = [
-                (self.calibrations[k - 1], self.Xs[k]) for k in (low, high) if k > 0
+                (self.calibrations[k - 1], self.Xs[k])
+                for k in (low, high)
+                if k > 0
             ]
         # Add in the frame of the rig's first sensor, and transform the sum to the second sensor.
         to_second = se3.adjoint(self.T(second, self.sensors[0]))
@@ -459,7 +492,8 @@ class RigCalibration:
             "sensors": list(self.sensors),
             "verdict": self.verdict.value,
             "closures": [
-                plain(closure) | {"closes": closure.closes} for closure in self.closures
+                plain(closure) | {"closes": closure.closes}
+                for closure in self.closures
             ],
             "calibrations": {
                 calibration.child_frame: calibration.to_dict()
@@ -504,7 +538,11 @@ def closure(
     components = directions.T @ se3.log(chain @ to_third.T_child_parent)
     error = directions @ components
     return Closure(
-        sensors=(to_second.parent_frame, to_second.child_frame, to_third.child_frame),
+        sensors=(
+            to_second.parent_frame,
+            to_second.child_frame,
+            to_third.child_frame,
+        ),
         translation_m=float(np.linalg.norm(error[:3])),
         rotation_rad=float(np.linalg.norm(error[3:])),
         chi2=float((components**2 / variances[is_determined]).sum()),

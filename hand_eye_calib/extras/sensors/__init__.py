@@ -3,7 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-from hand_eye_calib.core.base.registry import BAG_READINGS, FILE_READERS, TARGET_IMAGES
+from hand_eye_calib.core.base.registry import (
+    BAG_READINGS,
+    FILE_READERS,
+    TARGET_IMAGES,
+)
 
 
 def register() -> None:

@@ -47,7 +47,9 @@ class Camera:
     is_fisheye: bool
 
     @classmethod
-    def of(cls, where: object, matrix: Any, distortion: Any, model: str = "") -> Self:
+    def of(
+        cls, where: object, matrix: Any, distortion: Any, model: str = ""
+    ) -> Self:
         """Return the camera of 9 numbers of its matrix, coefficients and the name of their model.
 
         Raises
@@ -60,7 +62,9 @@ class Camera:
             if not np.isfinite(numbers).all() or numbers[0, 0] <= 0.0:
                 raise ValueError("no focal length")
             return cls(
-                numbers, np.array(distortion, dtype=float).ravel(), _IS_FISHEYE[model]
+                numbers,
+                np.array(distortion, dtype=float).ravel(),
+                _IS_FISHEYE[model],
             )
         except (KeyError, TypeError, ValueError):
             models = ", ".join(model for model in _IS_FISHEYE if model)
@@ -91,7 +95,9 @@ def read_camera(path: str | Path) -> Camera:
             distortion = _entries(document["distortion_coefficients"])
     except (AttributeError, KeyError, TypeError, ValueError):
         raise InputError(f"{path}: expected {_EXPECTED_CAMERA}") from None
-    return Camera.of(path, matrix, distortion, document.get("distortion_model", ""))
+    return Camera.of(
+        path, matrix, distortion, document.get("distortion_model", "")
+    )
 
 
 def _camera_of_visp(path: Path) -> Camera:
@@ -100,7 +106,9 @@ def _camera_of_visp(path: Path) -> Camera:
     ViSP's ``kud`` is the coefficient of the squared radius, as OpenCV's k1.
     """
     try:
-        models = list(ElementTree.fromstring(read_bytes(path)).iterfind(".//model"))
+        models = list(
+            ElementTree.fromstring(read_bytes(path)).iterfind(".//model")
+        )
         by_type = {model.findtext("type", ""): model for model in models}
         plain = by_type.get("perspectiveProjWithoutDistortion")
         model = by_type.get("perspectiveProjWithDistortion", plain)

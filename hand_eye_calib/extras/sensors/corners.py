@@ -88,10 +88,14 @@ def reprojections(
     return found
 
 
-def _projected(camera: Camera, T: FloatArray, corners: FloatArray) -> FloatArray:
+def _projected(
+    camera: Camera, T: FloatArray, corners: FloatArray
+) -> FloatArray:
     """Return the pixels (n, 2) of corners (n, 3) of the target at a pose (4, 4)."""
     cv2 = required("cv2", "drawing the corners of a target", "camera")
-    project = cv2.fisheye.projectPoints if camera.is_fisheye else cv2.projectPoints
+    project = (
+        cv2.fisheye.projectPoints if camera.is_fisheye else cv2.projectPoints
+    )
     vector = cv2.Rodrigues(T[:3, :3])[0]
     pixels, _ = project(
         corners[:, None], vector, T[:3, 3], camera.matrix, camera.distortion
@@ -180,7 +184,8 @@ def _tile(place: int, label: str, image: Any, stop: Reprojection) -> str:
     # A cross far outside would be drawn over other images.
     is_inside = ((predicted > 0) & (predicted < size)).all(axis=1)
     circles = "".join(
-        f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{_RADIUS:g}"/>' for u, v in detected
+        f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{_RADIUS:g}"/>'
+        for u, v in detected
     )
     arm = _RADIUS
     crosses = "".join(

@@ -18,7 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.errors import InputError, MissingDependencyError, required
+from hand_eye_calib.core.base.errors import (
+    InputError,
+    MissingDependencyError,
+    required,
+)
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -36,7 +40,10 @@ from hand_eye_calib.formats.trajectory_files.dates import (
     WEEK_S,
 )
 from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
-from hand_eye_calib.formats.trajectory_files.table import Table, columns_of_array
+from hand_eye_calib.formats.trajectory_files.table import (
+    Table,
+    columns_of_array,
+)
 
 # Names of the columns of a pose.
 _POSE = (*POSITION, *QUATERNION)
@@ -78,7 +85,9 @@ def table_of_program(
     head = data[:LONGEST_LINE].removeprefix(b"\xef\xbb\xbf").lstrip()
     for pattern, read in PROGRAMS.items():
         if re.search(pattern, head):
-            return foreign_table(path, data, read, options.columns, options.measures)
+            return foreign_table(
+                path, data, read, options.columns, options.measures
+            )
     return None
 
 
@@ -112,7 +121,9 @@ def foreign_table(
     return table.fill(enumerate(_text_rows(path, rows), 1), list)
 
 
-def _text_rows(path: str | Path, rows: Iterable[Sequence[Any]]) -> Iterator[list[str]]:
+def _text_rows(
+    path: str | Path, rows: Iterable[Sequence[Any]]
+) -> Iterator[list[str]]:
     """Yield the cells of rows as text, one row at a time, because a file may have millions of rows.
 
     Raises
@@ -162,21 +173,29 @@ def _of_gpx(data: bytes, _: str | None) -> _Rows:
             raise ValueError(
                 "a point of the GPX track has no time; record it with times"
             )
-        rows.append((time, point.attrib["lat"], point.attrib["lon"], height or "0"))
+        rows.append(
+            (time, point.attrib["lat"], point.attrib["lon"], height or "0")
+        )
     return _Rows(_PLACE, rows, ["heights of GPX are above the sea"])
 
 
 def _of_rtklib(data: bytes, _: str | None) -> _Rows:
     """Read a position file of RTKLIB or Emlid with latitude, longitude and height."""
     if b"latitude(deg)" not in data and data.startswith(b"%"):
-        raise ValueError("RTKLIB without degrees: set out-solformat to llh, degrees")
+        raise ValueError(
+            "RTKLIB without degrees: set out-solformat to llh, degrees"
+        )
     rows = []
     for line in _lines(data):
         cells = line.replace(",", " ").split()
         if not cells or cells[0].startswith("%"):
             continue
         date = cells[0].replace("/", "-")
-        stamp = f"{date}T{cells[1]}Z" if "-" in date else _of_week(cells[0], cells[1])
+        stamp = (
+            f"{date}T{cells[1]}Z"
+            if "-" in date
+            else _of_week(cells[0], cells[1])
+        )
         rows.append((stamp, *cells[2:5]))
     is_utc = re.search(rb"(?m)^%\s+(UTC|JST)\b", data)
     return _Rows(_PLACE, rows, [] if is_utc else [GPS_TIME])
@@ -200,14 +219,21 @@ def _of_novatel(data: bytes, _: str | None) -> _Rows:
             angles = cells[9:12]
         week = 5 if line[0] == "#" else 1
         rows.append(
-            (_of_week(header[week], header[week + 1]), *cells[2:4], height, *angles)
+            (
+                _of_week(header[week], header[week + 1]),
+                *cells[2:4],
+                height,
+                *angles,
+            )
         )
     if not rows:
         raise ValueError(
             "the log of NovAtel contains neither INSPVA nor INSPVAX: log one of them"
         )
     return _Rows(
-        (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"), rows, [GPS_TIME]
+        (*_PLACE, "roll [deg]", "pitch [deg]", "heading [deg]"),
+        rows,
+        [GPS_TIME],
     )
 
 
@@ -222,7 +248,9 @@ def _of_week(week: str, second: str) -> str:
 def _of_g2o(data: bytes, _: str | None) -> _Rows:
     """Read the vertices of a pose graph, in two or three dimensions."""
     vertices = [
-        line.split()[1:9] for line in _lines(data) if line.startswith("VERTEX_SE")
+        line.split()[1:9]
+        for line in _lines(data)
+        if line.startswith("VERTEX_SE")
     ]
     if not vertices:
         raise ValueError(
@@ -243,7 +271,9 @@ def _of_colmap(data: bytes, _: str | None) -> _Rows:
         )
     values = np.array([image[1:8] for image in images]).astype(float)
     Ts_camera_world = se3.from_quat_xyzw(values[:, 4:], values[:, [1, 2, 3, 0]])
-    return _of_images([image[9] for image in images], se3.inverse(Ts_camera_world), [])
+    return _of_images(
+        [image[9] for image in images], se3.inverse(Ts_camera_world), []
+    )
 
 
 def _of_json(data: bytes, _: str | None) -> _Rows:
@@ -251,7 +281,9 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
     document: Any = {}
     with suppress(ValueError, RecursionError):
         document = json.loads(data)
-    frames: Any = document.get("frames") if isinstance(document, dict) else document
+    frames: Any = (
+        document.get("frames") if isinstance(document, dict) else document
+    )
     names = set()
     if isinstance(frames, list) and frames and isinstance(frames[0], dict):
         names = set(frames[0])
@@ -260,7 +292,9 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
             (item["timestamp"], *item["translation"], *item["rotation"])
             for item in frames
         ]
-        return _Rows(("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(rows))
+        return _Rows(
+            ("t [us]", *POSITION, "qw", "qx", "qy", "qz"), sorted(rows)
+        )
     if "transform_matrix" not in names:
         raise ValueError(
             "it is JSON of an unsupported kind; expected transforms.json of "
@@ -276,7 +310,9 @@ def _of_json(data: bytes, _: str | None) -> _Rows:
     )
 
 
-def _of_images(names: Sequence[str], poses: FloatArray, notes: list[str]) -> _Rows:
+def _of_images(
+    names: Sequence[str], poses: FloatArray, notes: list[str]
+) -> _Rows:
     """Return rows of poses (N, 4, 4) with the names of their images.
 
     The last number in the name of an image is its stamp. There are no stamps unless every name has
@@ -284,7 +320,9 @@ def _of_images(names: Sequence[str], poses: FloatArray, notes: list[str]) -> _Ro
     """
     images = [Path(name).stem for name in names]
     matrices = _as_rows(poses).tolist()
-    rows = [(*matrix, image) for matrix, image in zip(matrices, images, strict=True)]
+    rows = [
+        (*matrix, image) for matrix, image in zip(matrices, images, strict=True)
+    ]
     stamps = []
     for image in images:
         numbers = re.findall(r"\d+\.\d+|\d+", image)
@@ -304,9 +342,13 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     lines = csv.reader(_lines(data))
     head = [*islice(lines, _MOTIVE_HEADER_LINES)]
     # Number of the last line of the header; 0 without such a line, so that there are no bodies.
-    last = next((row for row, cells in enumerate(head) if "Time (Seconds)" in cells), 0)
+    last = next(
+        (row for row, cells in enumerate(head) if "Time (Seconds)" in cells), 0
+    )
     # Number of the line with the kind of each column.
-    kinds = next((row for row in range(1, last) if "Rigid Body" in head[row]), None)
+    kinds = next(
+        (row for row in range(1, last) if "Rigid Body" in head[row]), None
+    )
     if kinds is None:
         raise ValueError("it contains no rigid bodies of Motive: export them")
     columns = zip(
@@ -332,7 +374,9 @@ def _of_motive(data: bytes, choice: str | None) -> _Rows:
     return _Rows(header, rows, [f"poses of rigid body {body}"])
 
 
-def _places_of_bodies(columns: Iterable[tuple[str, ...]]) -> dict[str, dict[str, int]]:
+def _places_of_bodies(
+    columns: Iterable[tuple[str, ...]],
+) -> dict[str, dict[str, int]]:
     """Return the columns of x, y, z, qx, qy, qz and qw of each rigid body of Motive.
 
     ``columns`` are the kind, the body, the quantity and the axis of each column.
@@ -359,7 +403,9 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
         )
     # Columns of each body: its rotation from RX on, then its position from TX on.
     starts = {
-        names[at] or "object": at for at, name in enumerate(columns) if name == "RX"
+        names[at] or "object": at
+        for at, name in enumerate(columns)
+        if name == "RX"
     }
     body = _chosen(starts, choice, "segments")
     start = starts[body]
@@ -376,7 +422,11 @@ def _of_vicon(data: bytes, choice: str | None) -> _Rows:
     else:
         kind = "rotation vectors"
         rotation = [f"{name} [{units[start]}]" for name in ROTATION_VECTOR]
-    header = ("t [s]", *rotation, *(f"{axis} [{units[place]}]" for axis in POSITION))
+    header = (
+        "t [s]",
+        *rotation,
+        *(f"{axis} [{units[place]}]" for axis in POSITION),
+    )
     return _Rows(header, rows, [f"poses of {body}; rotations read as {kind}"])
 
 
@@ -398,7 +448,9 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
         )
     columns = zip(names, fields["TYPE"], fields["SIZE"], strict=True)
     dtype = [(name, f"<{kind.lower()}{size}") for name, kind, size in columns]
-    return _Rows(names, np.frombuffer(body, dtype, int(fields["POINTS"][0])).tolist())
+    return _Rows(
+        names, np.frombuffer(body, dtype, int(fields["POINTS"][0])).tolist()
+    )
 
 
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
@@ -407,14 +459,18 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
     topics = ["vehicle_odometry", "vehicle_local_position", "vehicle_attitude"]
     try:
         log = pyulog.ULog(io.BytesIO(data), topics)
-        first_instances = [logged for logged in log.data_list if logged.multi_id == 0]
+        first_instances = [
+            logged for logged in log.data_list if logged.multi_id == 0
+        ]
         stamps_us, Ts = _logged_poses(
             {logged.name: logged.data for logged in first_instances}
         )
     # Damaged logs raise errors of many kinds.
     except Exception as error:
         reason = (
-            "" if isinstance(error, KeyError) else f", {type(error).__name__}: {error}"
+            ""
+            if isinstance(error, KeyError)
+            else f", {type(error).__name__}: {error}"
         )
         raise ValueError(
             f"the log of PX4 does not contain {' or '.join(topics[:2])}{reason}"
@@ -444,7 +500,9 @@ def _logged_poses(data: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
     stamps_us, positions = _logged(data["vehicle_local_position"], *POSITION)
     times_us, quats_xyzw = _logged(data["vehicle_attitude"], *quaternion)
     no_positions = np.zeros((len(times_us), 3))
-    attitudes = Trajectory.from_quat_xyzw(1000 * times_us, no_positions, quats_xyzw)
+    attitudes = Trajectory.from_quat_xyzw(
+        1000 * times_us, no_positions, quats_xyzw
+    )
     is_inside = (stamps_us >= times_us[0]) & (stamps_us <= times_us[-1])
     stamps_us = stamps_us[is_inside]
     Ts = attitudes.at(1000 * stamps_us)
@@ -452,7 +510,9 @@ def _logged_poses(data: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
     return stamps_us, Ts
 
 
-def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]:
+def _logged(
+    data: Mapping[str, Any], *names: str
+) -> tuple[IntArray, FloatArray]:
     """Return the valid values of a topic in a log of PX4, and their increasing stamps (us)."""
     values = np.stack([data[name] for name in names], axis=1).astype(float)
     is_valid = np.isfinite(values).all(axis=1)
@@ -461,9 +521,9 @@ def _logged(data: Mapping[str, Any], *names: str) -> tuple[IntArray, FloatArray]
         is_valid &= data[flag] > 0
     if not is_valid.any():
         raise ValueError(f"none of {', '.join(names)} is valid")
-    stamps_us = data.get("timestamp_sample", data["timestamp"])[is_valid].astype(
-        np.int64
-    )
+    stamps_us = data.get("timestamp_sample", data["timestamp"])[
+        is_valid
+    ].astype(np.int64)
     stamps_us, first = np.unique(stamps_us, return_index=True)
     return stamps_us, values[is_valid][first]
 

@@ -17,7 +17,9 @@ from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.formats.bags.sources import Reading
 
 
-def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReading":
+def read_images(
+    bag: PoseBag, stream: str, topic: str, text: str
+) -> "ImageReading":
     """Return the reader of images of a target.
 
     The intrinsics come from a file, or from a camera_info topic: that in the namespace of the
@@ -45,9 +47,12 @@ def read_images(bag: PoseBag, stream: str, topic: str, text: str) -> "ImageReadi
     if file:
         return ImageReading(stream, topic, target, read_camera(file))
     candidates = [
-        str(namespace / "camera_info") for namespace in PurePosixPath(topic).parents
+        str(namespace / "camera_info")
+        for namespace in PurePosixPath(topic).parents
     ]
-    info = next((candidate for candidate in candidates if candidate in bag.topics), "")
+    info = next(
+        (candidate for candidate in candidates if candidate in bag.topics), ""
+    )
     run = next(bag.runs([info]), None)
     if run is None:
         raise InputError(
@@ -64,7 +69,9 @@ class ImageReading(Reading):
     Images without the target are skipped.
     """
 
-    def __init__(self, stream: str, topic: str, target: Target, camera: Camera) -> None:
+    def __init__(
+        self, stream: str, topic: str, target: Target, camera: Camera
+    ) -> None:
         super().__init__(stream, topic)
         self._finder = TargetFinder(target, camera)
         self._frame = ""
@@ -72,11 +79,15 @@ class ImageReading(Reading):
         self._bag_ns = list[int]()
 
     def take(self, run: messages.Run) -> None:
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+        for message, bag_ns in zip(
+            run.decoded(), run.bag_ns.tolist(), strict=True
+        ):
             with located(self.name):
                 is_usable = self._finder.look(grey_of(message))
             if is_usable:
-                self._stamps_ns.append(messages.ns_of(message.header.stamp) or 0)
+                self._stamps_ns.append(
+                    messages.ns_of(message.header.stamp) or 0
+                )
                 self._bag_ns.append(bag_ns)
                 self._frame = printable(frame_name(message.header.frame_id))
 

@@ -47,7 +47,9 @@ def places_of(lines: Iterable[str]) -> tuple[list[list[float]], list[str]]:
             "NMEA: expected GGA sentences with a fix, and the date in RMC sentences"
         )
     notes = (
-        [f"{n_damaged} sentences with a wrong checksum left out"] if n_damaged else []
+        [f"{n_damaged} sentences with a wrong checksum left out"]
+        if n_damaged
+        else []
     )
     return rows, notes
 
@@ -86,7 +88,9 @@ def _gga_row(cells: Sequence[str], day_s: float) -> list[float]:
     """
     clock, lat, north, lon, east = cells[1:6]
     # hhmmss.ss, ddmm.mmmm and dddmm.mmmm.
-    stamp_s = day_s + 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
+    stamp_s = (
+        day_s + 3600 * int(clock[:2]) + 60 * int(clock[2:4]) + float(clock[4:])
+    )
     lat_deg = int(lat[:2]) + float(lat[2:]) / 60
     lon_deg = int(lon[:3]) + float(lon[3:]) / 60
     if north in "SW":

@@ -143,7 +143,9 @@ def scan_of(message: Any) -> Scan:
     elevations = np.arccos(-points[:, 2] / ranges[used])
     half_degrees = np.degrees(2 * elevations)
     rings = np.round(half_degrees).astype(int)
-    times_s, stamp_ns = times_of_points(rows[used], ns_of(message.header.stamp) or 0)
+    times_s, stamp_ns = times_of_points(
+        rows[used], ns_of(message.header.stamp) or 0
+    )
     frame = printable(frame_name(message.header.frame_id))
     return Scan(points, rings, times_s, stamp_ns, frame)
 
@@ -169,7 +171,9 @@ class ScanReading(Reading):
         self._state = np.array(
             [[file.stat().st_size, file.stat().st_mtime_ns] for file in files]
         )
-        self._path = bag.with_name(f"{bag.name}{topic.replace('/', '.')}.odometry.npz")
+        self._path = bag.with_name(
+            f"{bag.name}{topic.replace('/', '.')}.odometry.npz"
+        )
         self._stored: Mapping[str, Any] = {}
         # Many kinds of errors are possible: the file is absent, cut off, or of an older version.
         with suppress(Exception):
@@ -199,7 +203,9 @@ class ScanReading(Reading):
         self._sums = np.zeros((2, TUNING.n_rings))
 
     def take(self, run: Run) -> None:
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
+        for message, bag_ns in zip(
+            run.decoded(), run.bag_ns.tolist(), strict=True
+        ):
             scan = scan_of(message)
             if len(scan.points) > TUNING.n_neighbours:
                 self._bag_ns.append(bag_ns)
@@ -214,7 +220,9 @@ class ScanReading(Reading):
             text += f", {stored['n_failed']} of which could not be registered"
         self.notes.append(f"{text}; it is stored in {self._path}")
         frame = str(stored["frame"])
-        table = PoseTable.of(stored["stamps_ns"], stored["poses"], "scans", frame)
+        table = PoseTable.of(
+            stored["stamps_ns"], stored["poses"], "scans", frame
+        )
         return table.recorded(self.stream, stored["bag_ns"])
 
     def _finish(self) -> None:
@@ -267,8 +275,12 @@ class ScanReading(Reading):
     def _start_maps(self) -> None:
         """Begin the maps with the first scan."""
         points = self._thinned(self._still(-len(self._scans)), _FINE)
-        self._rough_map = self._gicp.GaussianVoxelMap(_ROUGH.map_voxel * self._voxel_m)
-        self._fine_map = self._gicp.GaussianVoxelMap(_FINE.map_voxel * self._voxel_m)
+        self._rough_map = self._gicp.GaussianVoxelMap(
+            _ROUGH.map_voxel * self._voxel_m
+        )
+        self._fine_map = self._gicp.GaussianVoxelMap(
+            _FINE.map_voxel * self._voxel_m
+        )
         self._rough_map.insert(points)
         self._fine_map.insert(points)
 
@@ -287,11 +299,15 @@ class ScanReading(Reading):
         if self._has_failed[index]:
             return
         if len(self._poses) % TUNING.learn_every == 0:
-            self._learn_range_errors(self._scans[index], still, self._poses[index])
+            self._learn_range_errors(
+                self._scans[index], still, self._poses[index]
+            )
         self._rough_map.insert(points, self._poses[index])
         self._fine_map.insert(points, self._poses[index])
 
-    def _align(self, index: int, points: Any, voxel_map: Any, step: Step) -> bool:
+    def _align(
+        self, index: int, points: Any, voxel_map: Any, step: Step
+    ) -> bool:
         """Register the points of a scan, and return whether enough of them match.
 
         If enough match, the pose of the scan is replaced, and the scan counts as registered.
@@ -320,7 +336,9 @@ class ScanReading(Reading):
         scan = self._scans[index]
         newest = slice(-len(self._scans), None)
         since_s = (np.array(self._stamps_ns[newest]) - scan.stamp_ns) * 1e-9
-        relative_poses = se3.inverse(self._poses[index]) @ np.array(self._poses[newest])
+        relative_poses = se3.inverse(self._poses[index]) @ np.array(
+            self._poses[newest]
+        )
         motions = se3.log(relative_poses)
         polynomial = np.linalg.lstsq(np.vander(since_s), motions, rcond=None)[0]
         part_numbers = np.round(scan.times_s / TUNING.part_s)
@@ -332,8 +350,12 @@ class ScanReading(Reading):
 
     def _thinned(self, points: FloatArray, step: Step) -> Any:
         """Return one point in each voxel, with its local plane, from points (N, 3)."""
-        thinned = self._gicp.voxelgrid_sampling(points, step.scan_voxel * self._voxel_m)
-        self._gicp.estimate_covariances(thinned, num_neighbors=TUNING.n_neighbours)
+        thinned = self._gicp.voxelgrid_sampling(
+            points, step.scan_voxel * self._voxel_m
+        )
+        self._gicp.estimate_covariances(
+            thinned, num_neighbors=TUNING.n_neighbours
+        )
         return thinned
 
     def _learn_range_errors(
@@ -353,11 +375,15 @@ class ScanReading(Reading):
             Pose of the middle of the scan in the map.
         """
         means = np.array(self._fine_map.voxel_points())[:, :3]
-        covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[:, :3, :3]
+        covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[
+            :, :3, :3
+        ]
         to_map = se3.rotation_of(pose).T
         points = still @ to_map + se3.translation_of(pose)
         rays = scan.points @ to_map
-        nearest, *_ = self._gicp.KdTree(means).batch_nearest_neighbor_search(points)
+        nearest, *_ = self._gicp.KdTree(means).batch_nearest_neighbor_search(
+            points
+        )
         voxels, voxel_of_point = np.unique(nearest, return_inverse=True)
         variances, axes = np.linalg.eigh(covariances[voxels])
         is_flat = variances[:, 0] < TUNING.flat * variances[:, 1]
@@ -373,5 +399,7 @@ class ScanReading(Reading):
         distances += cosines * self._too_far_m[scan.rings]
         products = np.bincount(scan.rings, cosines * distances, TUNING.n_rings)
         squares = np.bincount(scan.rings, cosines * cosines, TUNING.n_rings)
-        self._sums = TUNING.kept_share * self._sums + np.array([products, squares])
+        self._sums = TUNING.kept_share * self._sums + np.array(
+            [products, squares]
+        )
         self._too_far_m = self._sums[0] / (self._sums[1] + TUNING.prior_weight)

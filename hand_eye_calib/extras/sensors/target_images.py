@@ -170,7 +170,11 @@ class Target:
         columns, rows = map(int, parts[0].split("x"))
         size = float(parts[1])
         is_length = 0.0 < size < _LARGEST_SIZE_M
-        if min(columns, rows) < _FEWEST_ALONG_SIDE or not is_length or len(parts) > 2:
+        if (
+            min(columns, rows) < _FEWEST_ALONG_SIDE
+            or not is_length
+            or len(parts) > 2
+        ):
             raise ValueError("no chessboard")
         return cls("chessboard", columns, rows, size, 0.0, "")
 
@@ -182,7 +186,9 @@ def _no_target(text: str) -> ConfigError:
 def images_in(folder: Path) -> list[Path]:
     """Return the image files of a folder by name; numbers in names sort by value."""
     images = [
-        path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES
+        path
+        for path in folder.iterdir()
+        if path.suffix.lower() in IMAGE_SUFFIXES
     ]
     return sorted(images, key=lambda path: _by_number(path.name))
 
@@ -211,7 +217,9 @@ def image_in(data: Any, where: object) -> Any:
     """Decode an image file in grey; ``where`` names the file in errors."""
     cv2 = _opencv()
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(
+            np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE
+        )
     except cv2.error:
         raise InputError(
             f"{where} has more than {_MOST_PIXELS:,} pixels, or is damaged"
@@ -239,7 +247,9 @@ def grey_of(message: Any) -> Any:
             f"images are encoded as {message.encoding[:40]!r}; expected {expected}"
         )
     n_channels = message.step // message.width
-    rows = data.reshape(message.height, message.step)[:, : message.width * n_channels]
+    rows = data.reshape(message.height, message.step)[
+        :, : message.width * n_channels
+    ]
     image = rows.reshape(message.height, message.width, n_channels)
     if not conversion:
         return image[:, :, 0]
@@ -362,7 +372,9 @@ class TargetFinder:
         corners = self._corners[indices[is_on_target]].reshape(-1, 3)
         if len(corners) < self._target.fewest_corners:
             return False
-        pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)[is_on_target]
+        pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)[
+            is_on_target
+        ]
         pose = self._pose(corners, pixels.reshape(-1, 1, 2))
         is_good = pose.rms_px <= _LARGEST_RMS_PX
         if is_good:
@@ -401,9 +413,13 @@ class TargetFinder:
         cv2 = self._cv2
         camera = self.camera
         undistort = (
-            cv2.fisheye.undistortPoints if camera.is_fisheye else cv2.undistortPoints
+            cv2.fisheye.undistortPoints
+            if camera.is_fisheye
+            else cv2.undistortPoints
         )
-        rays = undistort(pixels, camera.matrix, camera.distortion).reshape(-1, 2)
+        rays = undistort(pixels, camera.matrix, camera.distortion).reshape(
+            -1, 2
+        )
         focal = camera.matrix[[0, 1], [0, 1]]
         # Rays are pixels of a camera without distortion, with this matrix.
         ideal = (np.eye(3), None)
@@ -413,12 +429,16 @@ class TargetFinder:
         candidates = []
         for start in zip(rotations, translations, strict=True):
             vector, shift = cv2.solvePnPRefineLM(corners, rays, *ideal, *start)
-            projected, derivatives = cv2.projectPoints(corners, vector, shift, *ideal)
+            projected, derivatives = cv2.projectPoints(
+                corners, vector, shift, *ideal
+            )
             residuals = (projected.reshape(-1, 2) - rays) * focal
             rms_px = float(np.sqrt((residuals**2).sum(axis=1).mean()))
             candidates.append((rms_px, vector, shift, derivatives[:, :6]))
         rms_px, vector, shift, derivatives = min(candidates, key=itemgetter(0))
-        T = se3.from_rotation_translation(cv2.Rodrigues(vector)[0], shift.ravel())
+        T = se3.from_rotation_translation(
+            cv2.Rodrigues(vector)[0], shift.ravel()
+        )
         jacobian = derivatives * np.tile(focal, len(corners))[:, None]
         # Each corner has two residuals. The pose has six degrees of freedom.
         degrees_of_freedom = 2 * len(corners) - 6
@@ -443,7 +463,8 @@ def _detector(cv2: Any, target: Target) -> _Detector:
     """
     if target.kind == "chessboard":
         return _Detector(
-            partial(_detect_chessboard, cv2, target), _chessboard_corners(target)
+            partial(_detect_chessboard, cv2, target),
+            _chessboard_corners(target),
         )
     dictionary = _dictionary(cv2, target)
     if target.kind == "aprilgrid":
@@ -493,7 +514,9 @@ def _tag_detector(
 
 def _detect_chessboard(cv2: Any, target: Target, image: Any) -> tuple[Any, Any]:
     """Return pixels and numbers of the inner corners of a chessboard, or None twice."""
-    is_found, pixels = cv2.findChessboardCornersSB(image, (target.columns, target.rows))
+    is_found, pixels = cv2.findChessboardCornersSB(
+        image, (target.columns, target.rows)
+    )
     if not is_found:
         return None, None
     return pixels, np.arange(len(pixels))

@@ -51,7 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "earlier demo are replaced. Default: demo_output"
     )
     parser.add_argument(
-        "--out", metavar="DIR", type=directory, default=Path("demo_output"), help=out
+        "--out",
+        metavar="DIR",
+        type=directory,
+        default=Path("demo_output"),
+        help=out,
     )
 
 
@@ -75,7 +79,9 @@ def run(arguments: argparse.Namespace) -> int:
             TOPICS["child"]: (drive.child, "nav_msgs/msg/Odometry"),
         }
         write_bag(bag_path, streams)
-    note(f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}")
+    note(
+        f"1/4 simulated {drive.parent.duration_s:.0f} s of driving into {bag_path}"
+    )
     recording = read_recording([bag_path], TOPICS, {})
     offline = recording.snapshot.estimate()
     note(
@@ -104,13 +110,22 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
 
     The context yields ``check()``, which raises a HandEyeCalibError if the node has ended.
     """
-    command = [sys.executable, "-m", "hand_eye_calib", "calibrator", "--ros-args"]
+    command = [
+        sys.executable,
+        "-m",
+        "hand_eye_calib",
+        "calibrator",
+        "--ros-args",
+    ]
     # Do not solve before all poses are sent. The player then calls ~/solve.
     command += ["-p", "solve_period:=1000.0"]
     for stream, topic in TOPICS.items():
         command += ["-r", f"{stream}_odom:={topic}"]
         # Both results must use the same messages, but best effort may lose some at this speed.
-        command += ["-p", f"qos_overrides.{topic}.subscription.reliability:=reliable"]
+        command += [
+            "-p",
+            f"qos_overrides.{topic}.subscription.reliability:=reliable",
+        ]
 
     def check() -> None:
         """Raise a HandEyeCalibError if the node has ended."""
@@ -122,7 +137,10 @@ def _node(log_path: Path) -> Iterator[Callable[[], None]]:
     with (
         log_path.open("wb") as log,
         subprocess.Popen(
-            command, stdout=log, stderr=subprocess.STDOUT, env=trusted_environment()
+            command,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=trusted_environment(),
         ) as process,
     ):
         try:

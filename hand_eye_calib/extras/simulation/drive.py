@@ -92,8 +92,12 @@ def simulate(
     >>> drive.parent
     Trajectory(100 poses over 9.900 s, sensor_frame='lidar', world_frame='lidar_odom')
     """
-    config = options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
-    config = replace(config, poses=poses, parent_frame="lidar", child_frame="camera")
+    config = (
+        options.HILLY_DRIVE if drive == "hilly" else options.PUBLISHED_DRIVE
+    )
+    config = replace(
+        config, poses=poses, parent_frame="lidar", child_frame="camera"
+    )
     noise = replace(
         options.REALISTIC, gaussian=gaussian, outliers=outliers, drift=drift
     )
@@ -124,7 +128,9 @@ def simulate_drive(
     SimulatedDrive
     """
     motion_rng, extrinsic_rng, noise_rng = np.random.default_rng(seed).spawn(3)
-    n_child = max(2, round(config.poses * config.child_rate / config.parent_rate))
+    n_child = max(
+        2, round(config.poses * config.child_rate / config.parent_rate)
+    )
     parent_times_s = np.arange(config.poses) / config.parent_rate
     child_times_s = config.child_delay + np.arange(n_child) / config.child_rate
     times_s = _LEAD_S + np.r_[parent_times_s, child_times_s]
@@ -140,9 +146,9 @@ def simulate_drive(
         T_parent_child = se3.from_rotation_translation(rotation, offset)
     # Pose of the child's world: yaw, pitch, roll (rad) and translation (m) are differences of two
     # uniform random numbers each.
-    angles, translation = extrinsic_rng.uniform(size=(2, 3)) - extrinsic_rng.uniform(
+    angles, translation = extrinsic_rng.uniform(
         size=(2, 3)
-    )
+    ) - extrinsic_rng.uniform(size=(2, 3))
     T_pw_cw = se3.from_rotation_translation(
         se3.rotation_from_rpy(angles[::-1]), translation
     )
@@ -153,9 +159,9 @@ def simulate_drive(
         times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str
     ) -> Trajectory:
         """Return a trajectory with stamps that begin at the start time of the drive."""
-        stamps_ns = round(config.start_time * 1e9) + np.round(times_s * 1e9).astype(
-            np.int64
-        )
+        stamps_ns = round(config.start_time * 1e9) + np.round(
+            times_s * 1e9
+        ).astype(np.int64)
         return Trajectory(stamps_ns, Ts_world_sensor, frame, f"{frame}_odom")
 
     return SimulatedDrive(
@@ -177,7 +183,9 @@ def _ground_track(
     n_arcs = int(times_s.max() // config.hold_time) + 2
     holds_s = np.full(n_arcs, config.hold_time)
     holds_s[0] = _FIRST_HOLD_S
-    yaw_rates = rng.uniform(-config.max_yaw_rate, config.max_yaw_rate, len(holds_s))
+    yaw_rates = rng.uniform(
+        -config.max_yaw_rate, config.max_yaw_rate, len(holds_s)
+    )
     starts_s = np.cumsum(holds_s) - holds_s
     headings = np.cumsum(yaw_rates * holds_s) - yaw_rates * holds_s
     arcs = _arc(config.speed, headings, yaw_rates, holds_s)
@@ -193,7 +201,10 @@ def _ground_track(
 
 
 def _arc(
-    speed: float, heading: FloatArray, yaw_rate: FloatArray, duration_s: FloatArray
+    speed: float,
+    heading: FloatArray,
+    yaw_rate: FloatArray,
+    duration_s: FloatArray,
 ) -> FloatArray:
     """Return the displacements (N, 2), m, along arcs that begin with these headings (N,), rad.
 
@@ -202,7 +213,9 @@ def _arc(
     half_turn = 0.5 * yaw_rate * duration_s
     chord = speed * duration_s * np.sinc(half_turn / np.pi)
     direction = heading + half_turn
-    return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
+    return np.stack(
+        [chord * np.cos(direction), chord * np.sin(direction)], axis=-1
+    )
 
 
 def _poses_on_terrain(
@@ -217,19 +230,24 @@ def _poses_on_terrain(
         # This formula was fitted to the published noise-free poses. It reproduces their heading
         # exactly, and pitch and roll to 0.01 rad. Yaw is the heading. Pitch and roll are the arc
         # sines of x and y of the normal. The rotation matrix is then transposed.
-        yaw_pitch_roll = np.stack([headings, *np.arcsin(normals[:, :2].T)], axis=-1)
+        yaw_pitch_roll = np.stack(
+            [headings, *np.arcsin(normals[:, :2].T)], axis=-1
+        )
         transposed = se3.rotation_from_rpy(yaw_pitch_roll[:, ::-1])
         rotations = np.swapaxes(transposed, -1, -2)
     else:
         # z is along the normal, and x is in the vertical plane of the heading.
         ahead = np.stack(
-            [np.cos(headings), np.sin(headings), np.zeros_like(headings)], axis=-1
+            [np.cos(headings), np.sin(headings), np.zeros_like(headings)],
+            axis=-1,
         )
         y_axes = np.cross(normals, ahead)
         y_axes /= np.linalg.norm(y_axes, axis=-1, keepdims=True)
         x_axes = np.cross(y_axes, normals)
         rotations = np.stack([x_axes, y_axes, normals], axis=-1)
-    return se3.from_rotation_translation(rotations, np.column_stack([positions, z]))
+    return se3.from_rotation_translation(
+        rotations, np.column_stack([positions, z])
+    )
 
 
 def surface(
@@ -256,7 +274,9 @@ def surface(
     return height * peaks, slope * sign_u * along_u, slope * sign_v * along_v
 
 
-def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _peaks(
+    x: FloatArray, y: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the height of three hills and three hollows, and its derivatives along x and y.
 
     This is the function ``peaks`` of MATLAB. All arrays have the same shape and no unit. The ground
@@ -278,7 +298,9 @@ def _peaks(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     return total, along_x, along_y
 
 
-def _mirrored(values: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
+def _mirrored(
+    values: FloatArray, limit: float
+) -> tuple[FloatArray, FloatArray]:
     """Return values (N,) mirrored at +/- ``limit``, which is a triangle wave, and its slope."""
     phase = np.mod(values + limit, 4.0 * limit)
     is_falling = phase > 2.0 * limit
@@ -313,7 +335,9 @@ def add_noise(
     Ts_cw_c = _with_gaussian(Ts_cw_c, noise, gaussian_rng)
     # Drift: each step is extended along one axis of the sensor, by a share of its length.
     axis = drift_rng.integers(3)
-    lengths_m = np.linalg.norm(np.diff(se3.translation_of(Ts_cw_c), axis=0), axis=1)
+    lengths_m = np.linalg.norm(
+        np.diff(se3.translation_of(Ts_cw_c), axis=0), axis=1
+    )
     steps = noise.drift * lengths_m[:, None] * Ts_cw_c[:-1, :3, axis]
     Ts_cw_c[1:, :3, 3] += np.cumsum(steps, axis=0)
     Ts_pw_p = _with_jumps(Ts_pw_p, noise.outliers, jump_rng)
@@ -322,14 +346,20 @@ def add_noise(
 
 
 def _with_gaussian(
-    Ts_world_sensor: FloatArray, noise: options.NoiseConfig, rng: np.random.Generator
+    Ts_world_sensor: FloatArray,
+    noise: options.NoiseConfig,
+    rng: np.random.Generator,
 ) -> FloatArray:
     """Add an independent error to each pose (N, 4, 4), in the frame of the sensor."""
     shape = (len(Ts_world_sensor), 3)
-    angles = noise.gaussian * noise.rotation_per_metre * rng.standard_normal(shape)
+    angles = (
+        noise.gaussian * noise.rotation_per_metre * rng.standard_normal(shape)
+    )
     rotations = se3.rotation_from_rpy(angles[:, ::-1])
     translations = noise.gaussian * rng.standard_normal(shape)
-    return Ts_world_sensor @ se3.from_rotation_translation(rotations, translations)
+    return Ts_world_sensor @ se3.from_rotation_translation(
+        rotations, translations
+    )
 
 
 def _with_jumps(

@@ -65,7 +65,9 @@ def play(
         results = [TransformStamped()]
         publishers = {}
         for stream, topic in topics.items():
-            publishers[stream] = node.create_publisher(Odometry, topic, _LOSSLESS)
+            publishers[stream] = node.create_publisher(
+                Odometry, topic, _LOSSLESS
+            )
         solve = node.create_client(Trigger, "calibrator/solve")
         node.create_subscription(
             TransformStamped, "calibrator/extrinsic", results.append, LATCHED
@@ -75,7 +77,8 @@ def play(
         def are_subscribed() -> bool:
             """Whether the node has subscribed to all topics."""
             return all(
-                publisher.get_subscription_count() for publisher in publishers.values()
+                publisher.get_subscription_count()
+                for publisher in publishers.values()
             )
 
         def has_all_poses() -> bool:

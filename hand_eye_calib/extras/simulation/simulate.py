@@ -71,9 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of recordings. Default: 1",
     )
-    same_mount = (
-        "all recordings have the extrinsic of the first, as those of one vehicle"
-    )
+    same_mount = "all recordings have the extrinsic of the first, as those of one vehicle"
     add("--same-mount", action="store_true", help=same_mount)
     seed = "the same seed gives the same recordings. Default: 0"
     add("--seed", type=at_least(0), default=0, help=seed)
@@ -115,14 +113,18 @@ def run(arguments: argparse.Namespace) -> int:
         for number in range(1, arguments.runs + 1)
     ]
     mount = None
-    for number, folder in with_progress(enumerate(folders), len(folders), "simulating"):
+    for number, folder in with_progress(
+        enumerate(folders), len(folders), "simulating"
+    ):
         drive = simulate_drive((arguments.seed, number), config, noise, mount)
         if arguments.same_mount:
             mount = drive.T_parent_child
         _make_empty(folder)
         write_trajectory(folder / PARENT_FILE, drive.parent)
         write_trajectory(folder / CHILD_FILE, drive.child)
-        truth = Trajectory(drive.parent.stamps_ns[:1], drive.T_parent_child[None])
+        truth = Trajectory(
+            drive.parent.stamps_ns[:1], drive.T_parent_child[None]
+        )
         write_trajectory(folder / TRUTH_FILE, truth)
         if arguments.bag:
             from hand_eye_calib.formats.bags.writer import write_bag
@@ -143,7 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
             "noise": noise,
         }
     print_result(
-        [f"{counted(len(folders), 'recording')} written to {arguments.out}"], document
+        [f"{counted(len(folders), 'recording')} written to {arguments.out}"],
+        document,
     )
     return 0
 

@@ -20,7 +20,9 @@ _SAMPLES = (".json", ".yaml", ".yml", ".samples", ".npz")
 
 def register() -> None:
     """Register the command ``arm``, and stops for ``calibrate``."""
-    COMMANDS["arm"] = Command("calibrate the camera of an arm from its stops", _arm)
+    COMMANDS["arm"] = Command(
+        "calibrate the camera of an arm from its stops", _arm
+    )
     RESULT_PARTS["worlds"] = _worlds
     RESULT_PARTS["stops"] = _stops
     FINDING_WORDS["stops"] = _words
@@ -43,7 +45,9 @@ def _add_arguments(parser: Any) -> None:
         "samples of an arm (MoveIt, easy_handeye2, OpenCV, .npz, a folder with a file for each "
         "pose), given as the only PATH"
     )
-    parser.add_argument("--order", choices=("time", "none"), default="time", help=order)
+    parser.add_argument(
+        "--order", choices=("time", "none"), default="time", help=order
+    )
     setup = (
         "where the camera of an arm is: on the hand, or beside the robot with the target on the "
         "hand. Default: as the samples fit"
@@ -97,7 +101,9 @@ def _are_stops(arguments: Any) -> bool:
     return are_stops
 
 
-def _refuse_without_stops(arguments: Any, are_stops: bool, has_hand_file: bool) -> None:
+def _refuse_without_stops(
+    arguments: Any, are_stops: bool, has_hand_file: bool
+) -> None:
     """Raise ConfigError for an option of an arm, or of the file of its hand, without such input."""
     if arguments.setup and not are_stops:
         raise ConfigError(

@@ -108,7 +108,9 @@ def calibrate_stops(
     (4, 4)
     """
     config = _checked(config, options)
-    poses = _checked_poses({"parent": Ts_world_parent, "child": Ts_world_child}, config)
+    poses = _checked_poses(
+        {"parent": Ts_world_parent, "child": Ts_world_child}, config
+    )
     solved = solve_checked(poses, config)
     warnings = list(solved.warnings)
     if solved.is_usable and not _INVERSIONS & config.given:
@@ -197,7 +199,9 @@ def calibrate_hand_and_camera(
     this place needs the option ``setup``.
     """
     config = _checked(config, {})
-    poses = _checked_poses({"hand": Ts_base_hand, "camera": Ts_target_camera}, config)
+    poses = _checked_poses(
+        {"hand": Ts_base_hand, "camera": Ts_target_camera}, config
+    )
     return _calibrated_arm(
         replace(poses, is_arm=True), config, _names_of_frames(None), setup
     )
@@ -255,7 +259,9 @@ def _checked(
         )
     if options:
         prior = prior_fields(options.get("prior", {}))
-        others = {name: value for name, value in options.items() if name != "prior"}
+        others = {
+            name: value for name, value in options.items() if name != "prior"
+        }
         config = CalibratorConfig(**{**others, **prior})
     if not isinstance(config, CalibratorConfig | None):
         raise InputError(
@@ -277,7 +283,9 @@ def _checked(
     return config
 
 
-def _checked_poses(sides: Mapping[str, Any], config: CalibratorConfig) -> StopPoses:
+def _checked_poses(
+    sides: Mapping[str, Any], config: CalibratorConfig
+) -> StopPoses:
     """Return the poses of parent and child as stacks; ``sides`` are their values by name.
 
     Positions are zero if only rotations are measured.
@@ -326,7 +334,10 @@ def _is_copy(fit: RobotWorld) -> bool:
     offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
     return bool(
-        np.all(np.abs(offsets) < np.maximum(_MIN_IDENTITY, _IDENTITY_SIGMAS * sigmas))
+        np.all(
+            np.abs(offsets)
+            < np.maximum(_MIN_IDENTITY, _IDENTITY_SIGMAS * sigmas)
+        )
     )
 
 
@@ -360,7 +371,10 @@ def _check_distances(
     if setup_fit.is_inverse:
         on_hand_m, from_base_m = from_base_m, on_hand_m
         moving, fixed = fixed, moving
-    if on_hand_m <= _MAX_ON_HAND_M or from_base_m >= _MAX_BASE_RATIO * on_hand_m:
+    if (
+        on_hand_m <= _MAX_ON_HAND_M
+        or from_base_m >= _MAX_BASE_RATIO * on_hand_m
+    ):
         return []
     what = (
         f"{moving} would be {on_hand_m:.2g} m from {frames['hand']}, {fixed} {from_base_m:.2g} m "
@@ -389,7 +403,11 @@ def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
     """Return the frames of an arm; ``names`` are those of base, hand, camera and target."""
     if is_beside:
         return _Frames(
-            names["base"], names["camera"], names["hand"], names["target"], "beside"
+            names["base"],
+            names["camera"],
+            names["hand"],
+            names["target"],
+            "beside",
         )
     return _Frames(
         names["hand"], names["camera"], names["base"], names["target"], "hand"
@@ -415,7 +433,9 @@ def _calibration_of(
         covariance_Z = _without_positions(covariance_Z)
         unknown = _with_unknown_positions(unknown)
     fused = fuse(combined(X, covariance_X, unknown), config.prior())
-    errors = se3.log(se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X)
+    errors = se3.log(
+        se3.inverse(Z @ stops.Ts_world_child) @ stops.Ts_world_parent @ X
+    )
     rows = np.arange(len(errors))
     residuals = Residuals(
         translation=errors[:, :3] @ se3.rotation_of(X).T,
@@ -450,7 +470,9 @@ def _calibration_of(
     )
 
 
-def _with_advice(table: StopTable, solved: SolvedStops, frames: _Frames) -> StopTable:
+def _with_advice(
+    table: StopTable, solved: SolvedStops, frames: _Frames
+) -> StopTable:
     """Return the table of stops, with advice on the next stops to record."""
     config = solved.config
     is_beside = frames.setup == "beside"

@@ -20,7 +20,12 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import defaults_of
 from hand_eye_calib.core.base.option import options_in_words
 from hand_eye_calib.core.base.stats import median
-from hand_eye_calib.core.checks.findings import Finding, Severity, conventions, finding
+from hand_eye_calib.core.checks.findings import (
+    Finding,
+    Severity,
+    conventions,
+    finding,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import has_error
 from hand_eye_calib.extras.stops.robot_world import inliers_of, objective_of
@@ -144,7 +149,9 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
     examination = Examination(tuple(findings), repairs)
     if has_error(findings):
         return examination
-    return _with_units(sample, replace(examination, scale=chosen.scale), is_scale_free)
+    return _with_units(
+        sample, replace(examination, scale=chosen.scale), is_scale_free
+    )
 
 
 def _check_rotations(poses: StopPoses) -> list[Finding]:
@@ -171,7 +178,10 @@ def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
         for is_inverse in sample.possible_inversions
     ]
     as_given = _better_setup(plain)
-    if as_given.unexplained_share < SMALL_UNEXPLAINED or not sample.has_positions:
+    if (
+        as_given.unexplained_share < SMALL_UNEXPLAINED
+        or not sample.has_positions
+    ):
         return as_given, []
     objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
     smallest = min(objectives.values())
@@ -179,7 +189,9 @@ def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
     gain = min(_objective(sample, fit) for fit in plain) - smallest
     if gain < -MIN_LEAD:
         return as_given, []
-    likely = [rival for rival in objectives if objectives[rival] < smallest + MIN_LEAD]
+    likely = [
+        rival for rival in objectives if objectives[rival] < smallest + MIN_LEAD
+    ]
     likely = _with_fewest_mistakes(likely)
     if gain < min_certain_gain(len(sample)):
         return as_given, [rival.mistakes for rival in likely]
@@ -208,10 +220,16 @@ def _with_fewest_mistakes(fits: Sequence[RoughFit]) -> list[RoughFit]:
 def _rivals(sample: StopPoses) -> list[RoughFit]:
     """Return the best rough fits of hypotheses with mistakes."""
     rivals = []
-    for parent, child, is_inverse in itertools.product(_CODES, _CODES, (False, True)):
-        is_plain = not (parent or child) and is_inverse in sample.possible_inversions
+    for parent, child, is_inverse in itertools.product(
+        _CODES, _CODES, (False, True)
+    ):
+        is_plain = (
+            not (parent or child) and is_inverse in sample.possible_inversions
+        )
         if not is_plain:
-            rivals.append(rough_fit(sample, Mistakes(parent, child, is_inverse)))
+            rivals.append(
+                rough_fit(sample, Mistakes(parent, child, is_inverse))
+            )
     rivals.sort(key=lambda rival: -rival.log_likelihood)
     return rivals[:_MAX_RIVALS]
 
@@ -243,7 +261,9 @@ def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
     rival_options = _options_of(rival)
     # Each list has all options that either hypothesis sets, with defaults where necessary. So a
     # user who sets a list selects one hypothesis.
-    first = options | defaults_of(name for name in rival_options if name not in options)
+    first = options | defaults_of(
+        name for name in rival_options if name not in options
+    )
     second = rival_options | defaults_of(
         name for name in options if name not in rival_options
     )
@@ -277,7 +297,8 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     position_share = fit.position_share
     ratio = fit.position_ratio
     are_too_large = (
-        rotation_share > MAX_UNEXPLAINED or position_share > UNRELATED_UNEXPLAINED
+        rotation_share > MAX_UNEXPLAINED
+        or position_share > UNRELATED_UNEXPLAINED
     )
     are_beyond_noise = (
         position_share > SMALL_UNEXPLAINED and ratio > _MAX_POSITION_RATIO
@@ -285,7 +306,8 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
     if not (are_too_large or are_beyond_noise):
         return []
     contradict = (
-        position_share > _CONTRADICTING_SHARE and ratio > _CONTRADICTING_POSITION_RATIO
+        position_share > _CONTRADICTING_SHARE
+        and ratio > _CONTRADICTING_POSITION_RATIO
     )
     if contradict or fit.unexplained_share > MAX_UNEXPLAINED:
         severity = Severity.ERROR
@@ -295,7 +317,9 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
         return []
     part = "rotations" if rotation_share > position_share else "positions"
     share = min(fit.unexplained_share, 1.0)
-    return [finding("disagreeing_stops", severity=severity, part=part, share=share)]
+    return [
+        finding("disagreeing_stops", severity=severity, part=part, share=share)
+    ]
 
 
 def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
@@ -358,7 +382,9 @@ def _fits_with_other_axes(sample: StopPoses) -> Iterator[_OtherAxes]:
         mistakes = Mistakes(is_inverse=is_inverse)
         if rough_fit(sample, mistakes).rotation_share > MAX_UNEXPLAINED:
             continue
-        for axes, stream in itertools.product(_other_axes(), ("child", "parent")):
+        for axes, stream in itertools.product(
+            _other_axes(), ("child", "parent")
+        ):
             Ts = getattr(sample, stream)
             turned = se3.from_rotation_translation(
                 se3.rotation_of(Ts), se3.translation_of(Ts) @ axes.T
@@ -404,7 +430,9 @@ def _with_units(
     of_child = _unit_of_size(se3.translation_of(sample.child))
     if scale is not None:
         to_metres = scale * of_parent
-        nearest = min((1.0, *_UNITS), key=lambda unit: abs(np.log(to_metres / unit)))
+        nearest = min(
+            (1.0, *_UNITS), key=lambda unit: abs(np.log(to_metres / unit))
+        )
         is_unit = abs(np.log(to_metres / nearest)) < np.log(_MAX_SIZE_FACTOR)
         of_child = nearest if is_unit else 1.0
         scale = to_metres / of_child
@@ -425,7 +453,9 @@ def _with_units(
 
 
 def _unit_finding(stream: str, option: str, unit: float) -> Finding:
-    return finding("stop_units", stream, options={option: unit}, unit=_UNITS[unit])
+    return finding(
+        "stop_units", stream, options={option: unit}, unit=_UNITS[unit]
+    )
 
 
 def _unit_of_size(positions: FloatArray) -> float:

@@ -65,7 +65,9 @@ def solved(arguments: Namespace) -> SolvedInput:
     if len(paths) == 1:
         samples = read_arm_samples(paths[0])
         if samples.calibration is not None:
-            note(f"place of the camera and names of frames: {samples.calibration}")
+            note(
+                f"place of the camera and names of frames: {samples.calibration}"
+            )
         setup = arguments.setup or samples.setup
         result = calibrate_arm(
             samples.robot, samples.tracking, config, samples.frames, setup
@@ -130,7 +132,9 @@ def _from_images(
         (hand,) = _read(arguments, [hand_path], options)
     _require_equal([hand_path, folder], len(hand), len(images))
     config = _measuring(config, {"parent": hand})
-    finder = target_images.TargetFinder.parse(arguments.target, arguments.camera)
+    finder = target_images.TargetFinder.parse(
+        arguments.target, arguments.camera
+    )
     for image in with_progress(images, len(images), "finding the target"):
         finder.look(target_images.read_image(image))
     detections = finder.found()
@@ -176,7 +180,9 @@ def _robot(arguments: Namespace) -> Trajectory:
     return Trajectory(np.arange(len(poses)), poses)
 
 
-def _require_equal(paths: Sequence[str | Path], n_parent: int, n_child: int) -> None:
+def _require_equal(
+    paths: Sequence[str | Path], n_parent: int, n_child: int
+) -> None:
     """Raise InputError if both sides have different numbers of stops."""
     if n_parent != n_child:
         raise InputError(
@@ -213,7 +219,9 @@ def _refuse_ignored(arguments: Namespace) -> None:
     names += [f"{stream}_{name}" for stream in STREAMS for name in of_streams]
     for name in names:
         if getattr(arguments, name, None):
-            raise ConfigError(f"--{flag(name)} has no meaning for stops; leave it out")
+            raise ConfigError(
+                f"--{flag(name)} has no meaning for stops; leave it out"
+            )
 
 
 def _measuring(

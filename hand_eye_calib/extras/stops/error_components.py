@@ -50,7 +50,9 @@ _SMALL_LOG_CHANGE = 0.05
 MIN_VARIANCE = 1e-24
 
 # Errors (N, 6) of stops and their derivatives (N, 6, 12), for X and Z.
-Linearise = Callable[[Stops, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Linearise = Callable[
+    [Stops, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
+]
 
 
 @dataclass(frozen=True)
@@ -107,11 +109,15 @@ def fit_components(
     components = prior
     for _ in range(_MAX_ROUNDS):
         errors, jacobian = linearise(stops, X, Z)
-        iteration = _iteration(components, sources, errors, jacobian, weights, degrees)
+        iteration = _iteration(
+            components, sources, errors, jacobian, weights, degrees
+        )
         step_X, step_Z = se3.exp(iteration.step.reshape(2, 6))
         X = X @ step_X
         Z = Z @ step_Z
-        updated = _updated(components, prior, iteration.quadratic, iteration.expected)
+        updated = _updated(
+            components, prior, iteration.quadratic, iteration.expected
+        )
         log_change = float(np.max(np.abs(np.log(updated / components))))
         components = updated
         if iteration.decrease < _SMALL_CHANGE**2 and log_change < _SMALL_CHANGE:
@@ -167,7 +173,9 @@ def fit_linear(
     sources = _covariances_of_sources(stops)
     prior = _prior_components(variances, len(sources))
     components = prior
-    lengths = np.sqrt(np.einsum("nij,nij->j", jacobian, jacobian) + MIN_VARIANCE)
+    lengths = np.sqrt(
+        np.einsum("nij,nij->j", jacobian, jacobian) + MIN_VARIANCE
+    )
     columns = jacobian / lengths
     values = np.zeros(len(lengths))
     for _ in range(_MAX_LINEAR_ROUNDS):
@@ -176,7 +184,9 @@ def fit_linear(
             components, sources, remaining, columns, weights, degrees
         )
         values = values + iteration.step
-        updated = _updated(components, prior, iteration.quadratic, iteration.expected)
+        updated = _updated(
+            components, prior, iteration.quadratic, iteration.expected
+        )
         log_change = float(np.max(np.abs(np.log(updated / components))))
         components = updated
         if (
@@ -188,7 +198,9 @@ def fit_linear(
     by_values = iteration.precisions @ columns
     information = np.einsum("n,nij,nik->jk", shares, columns, by_values)
     damping = 1e-10 * np.trace(information) * np.eye(len(values))
-    covariance = np.linalg.inv(information + damping) / np.outer(lengths, lengths)
+    covariance = np.linalg.inv(information + damping) / np.outer(
+        lengths, lengths
+    )
     covariance = np.asarray(covariance, dtype=float)
     return LinearFit(values / lengths, covariance, iteration.student)
 
@@ -234,7 +246,9 @@ def _iteration(
     ``components`` (K,) are the variances of the sources, ``sources`` (K, N, 6, 6) the covariances
     with variance 1.
     """
-    covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(6)
+    covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(
+        6
+    )
     precisions = np.asarray(np.linalg.inv(covariances), dtype=float)
     scores = np.einsum("nij,nj->ni", precisions, errors)
     distances = np.einsum("ni,ni->n", errors, scores)
@@ -250,7 +264,9 @@ def _iteration(
     fitted = np.linalg.solve(damped, np.swapaxes(by_values, 1, 2))
     projected = precisions - shares[:, None, None] * (by_values @ fitted)
     expected = np.einsum("nij,knji->k", projected, sources)
-    return _Iteration(precisions, student, step, -step @ gradient, quadratic, expected)
+    return _Iteration(
+        precisions, student, step, -step @ gradient, quadratic, expected
+    )
 
 
 def _updated(
@@ -298,10 +314,14 @@ def _covariances_of_sources(stops: Stops) -> FloatArray:
     covariances[0, :, :3, :3] = across
     covariances[1, :, :3, :3] = along
     covariances[2, :, 3:, 3:] = np.eye(3)
-    covariances[3] = _about_world(np.broadcast_to(np.eye(3), (n, 3, 3)), to_world)
+    covariances[3] = _about_world(
+        np.broadcast_to(np.eye(3), (n, 3, 3)), to_world
+    )
     if not stops.has_target:
         return covariances
-    variances = usual_sine(stops) ** 2 / sines_of_views(stops.Ts_world_child) ** 2
+    variances = (
+        usual_sine(stops) ** 2 / sines_of_views(stops.Ts_world_child) ** 2
+    )
     tilts = _about_world(variances[:, None, None] * across, to_world)
     return np.concatenate([covariances, tilts[None]])
 

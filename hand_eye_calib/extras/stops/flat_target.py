@@ -24,7 +24,9 @@ def sines_of_views(Ts_target_camera: FloatArray) -> FloatArray:
     positions = se3.translation_of(Ts_target_camera)
     lengths = np.linalg.norm(positions, axis=1)
     across = np.linalg.norm(positions[:, :2], axis=1)
-    return np.asarray(np.maximum(across / np.maximum(lengths, _TINY_M), _MIN_SINE))
+    return np.asarray(
+        np.maximum(across / np.maximum(lengths, _TINY_M), _MIN_SINE)
+    )
 
 
 def usual_sine(stops: Stops) -> float:

@@ -67,7 +67,9 @@ def correlations(views: FloatArray) -> FloatArray:
     distances = np.stack([*[places] * _N_BY_PLACE, *[ways] * n_by_way])
     distances = distances / _RANGES_RAD[:, None, None]
     white = _WHITE_SHARES[:, None, None]
-    return np.asarray(white * np.eye(len(views)) + (1.0 - white) * np.exp(-distances))
+    return np.asarray(
+        white * np.eye(len(views)) + (1.0 - white) * np.exp(-distances)
+    )
 
 
 def kernel_weights(kernels: FloatArray, rows: FloatArray) -> FloatArray:
@@ -87,7 +89,9 @@ def kernel_weights(kernels: FloatArray, rows: FloatArray) -> FloatArray:
     n_columns = rows.shape[2]
     factors = np.linalg.cholesky(kernels)
     whitened = np.linalg.solve(factors, rows.reshape(1, n, -1))
-    triangles = np.linalg.qr(whitened.reshape(len(kernels), 6 * n, n_columns), mode="r")
+    triangles = np.linalg.qr(
+        whitened.reshape(len(kernels), 6 * n, n_columns), mode="r"
+    )
     diagonals = np.abs(np.diagonal(triangles, 0, 1, 2)) + _TINY
     # The last diagonal element is the length of the residuals after the fit of the M values.
     log_variances = 2.0 * np.log(diagonals[:, -1])

@@ -14,7 +14,10 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.error_components import fit_linear
-from hand_eye_calib.extras.stops.lasting_errors import rest_weights, views_of_stops
+from hand_eye_calib.extras.stops.lasting_errors import (
+    rest_weights,
+    views_of_stops,
+)
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, rows_of
 from hand_eye_calib.extras.stops.rough_fit import MAX_COMPARED
 
@@ -76,17 +79,23 @@ class _Movement:
     squared: float
 
 
-def check_movement(stops: Stops, fit: RobotWorld, is_arm: bool) -> Finding | None:
+def check_movement(
+    stops: Stops, fit: RobotWorld, is_arm: bool
+) -> Finding | None:
     """Return a finding if the camera or the target clearly moved between two stops."""
     n = len(stops)
-    sampled = np.unique(np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64))
+    sampled = np.unique(
+        np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64)
+    )
     movements = _movements(stops[sampled], fit)
     if not movements:
         return None
     movement = max(movements, key=lambda movement: movement.squared)
     shift_m = float(np.linalg.norm(movement.change[:3]))
     turn_rad = float(np.linalg.norm(movement.change[3:]))
-    is_clear = movement.squared > _MIN_SQUARED + _MIN_SQUARED_TIMES_STOPS / len(sampled)
+    is_clear = movement.squared > _MIN_SQUARED + _MIN_SQUARED_TIMES_STOPS / len(
+        sampled
+    )
     if not is_clear or (shift_m < _MIN_SHIFT_M and turn_rad < _MIN_TURN_RAD):
         return None
     return finding(
@@ -104,7 +113,9 @@ def _movements(stops: Stops, fit: RobotWorld) -> list[_Movement]:
     n = len(stops)
     rows = rows_of(stops, fit)
     errors = rows[:, :, _N_COLUMNS]
-    weights = rest_weights(views_of_stops(stops.Ts_world_parent, stops.Ts_world_child))
+    weights = rest_weights(
+        views_of_stops(stops.Ts_world_parent, stops.Ts_world_child)
+    )
     variances = np.square([fit.level_m, fit.level_rad])
     starts = np.unique(np.round(_SHARES * n).astype(np.int64))
     movements = []
@@ -113,7 +124,9 @@ def _movements(stops: Stops, fit: RobotWorld) -> list[_Movement]:
             after = rows[:, :, columns].copy()
             after[:start] = 0.0
             jacobian = np.concatenate([rows[:, :, :_N_COLUMNS], after], axis=2)
-            linear = fit_linear(stops, errors, jacobian, variances, weights, _DEGREES)
+            linear = fit_linear(
+                stops, errors, jacobian, variances, weights, _DEGREES
+            )
             typical = min(
                 median(linear.weights[:start]), median(linear.weights[start:])
             )

@@ -43,7 +43,11 @@ class NextStop:
 
 
 def next_stops(
-    stops: Stops, fit: RobotWorld, frame: str, is_inverse: bool, targets: FloatArray
+    stops: Stops,
+    fit: RobotWorld,
+    frame: str,
+    is_inverse: bool,
+    targets: FloatArray,
 ) -> tuple[int, tuple[NextStop, ...]]:
     """Choose the next stops of an arm, the most useful first.
 
@@ -82,7 +86,8 @@ def next_stops(
     chosen = []
     for _ in range(_N_NEXT):
         costs = {
-            stop: _cost(information + gain, targets) for stop, gain in gains.items()
+            stop: _cost(information + gain, targets)
+            for stop, gain in gains.items()
         }
         best = min(costs, key=costs.__getitem__)
         chosen.append(best)

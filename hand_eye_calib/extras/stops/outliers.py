@@ -36,7 +36,9 @@ def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
     n_smaller = int(np.sum(fit.weights == 0.0)) - count
     smaller = ""
     if n_smaller:
-        smaller = f" (and {counted(n_smaller, 'smaller outlier')}, see the residuals)"
+        smaller = (
+            f" (and {counted(n_smaller, 'smaller outlier')}, see the residuals)"
+        )
     return [
         finding(
             "outlier_stops",
@@ -57,7 +59,9 @@ def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
     The errors are those in the frame of the child, or in that of its world if they are smaller.
     """
     predicted = (
-        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+        se3.inverse(fit.T_world_world)
+        @ stops.Ts_world_parent
+        @ fit.T_parent_child
     )
     measured = se3.inverse(stops.Ts_world_child)
     errors = se3.log(np.stack([measured @ predicted, predicted @ measured]))

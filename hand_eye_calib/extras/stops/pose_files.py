@@ -25,7 +25,17 @@ _SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 
 # Words for the sides in names of files. ViSP names the pose of b in a ``aPb``, where f is the base,
 # e the end effector, c the camera and o the object (target).
-_ROBOT_WORDS = {"pe", "robot", "hand", "gripper", "flange", "ee", "eef", "tcp", "tool"}
+_ROBOT_WORDS = {
+    "pe",
+    "robot",
+    "hand",
+    "gripper",
+    "flange",
+    "ee",
+    "eef",
+    "tcp",
+    "tool",
+}
 _TARGET_WORDS = {
     "po",
     "target",
@@ -95,7 +105,9 @@ def read_pose_folder(folder: Path) -> tuple[FloatArray, FloatArray]:
     incomplete = sorted(robot.keys() ^ target.keys())
     if incomplete:
         numbers = listing([str(stop) for stop in incomplete[:8]])
-        raise InputError(f"{folder}: each stop needs both poses; incomplete: {numbers}")
+        raise InputError(
+            f"{folder}: each stop needs both poses; incomplete: {numbers}"
+        )
     stops = sorted(robot)
     Ts_base_hand = np.stack([_read_pose(robot[stop]) for stop in stops])
     Ts_camera_target = np.stack([_read_pose(target[stop]) for stop in stops])

@@ -75,7 +75,9 @@ def robot_poses(rows: Any, robot: str) -> FloatArray:
     positions = values[:, :3]
     angles = values[:, 3:]
     if robot == "abb":
-        return pose_stack(np.c_[positions, np.roll(angles, -1, axis=1)], "robot")
+        return pose_stack(
+            np.c_[positions, np.roll(angles, -1, axis=1)], "robot"
+        )
     return pose_stack((_rotations(angles, robot), positions), "robot")
 
 

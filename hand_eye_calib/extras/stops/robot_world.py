@@ -25,7 +25,10 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.stats import student_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops, starts_of
-from hand_eye_calib.extras.stops.error_components import MIN_VARIANCE, fit_components
+from hand_eye_calib.extras.stops.error_components import (
+    MIN_VARIANCE,
+    fit_components,
+)
 from hand_eye_calib.extras.stops.lasting_errors import (
     correlations,
     kernel_weights,
@@ -221,8 +224,12 @@ def _inverse_of(information: FloatArray, rough: RobotWorld) -> FloatArray:
 
     Their prior has a thousand times the standard deviations of a stop in the fit ``rough``.
     """
-    prior = np.tile(np.repeat([1e-3 / rough.level_m, 1e-3 / rough.level_rad], 3), 2)
-    return np.asarray(np.linalg.inv(information + np.diag(prior**2)), dtype=float)
+    prior = np.tile(
+        np.repeat([1e-3 / rough.level_m, 1e-3 / rough.level_rad], 3), 2
+    )
+    return np.asarray(
+        np.linalg.inv(information + np.diag(prior**2)), dtype=float
+    )
 
 
 def _fit_without_outliers(
@@ -238,7 +245,9 @@ def _fit_without_outliers(
     """
     n = len(stops)
     fewest_degrees = _FEWEST_DEGREES / (n - 2)
-    rough = _fit(stops, start, in_world, max(fewest_degrees, _OUTLIER_DEGREES), rests)
+    rough = _fit(
+        stops, start, in_world, max(fewest_degrees, _OUTLIER_DEGREES), rests
+    )
     is_kept = rough.weights > 0.0
     fit = _fit(
         stops[is_kept],
@@ -252,7 +261,9 @@ def _fit_without_outliers(
     # In the objective, each outlier has the squared distance of the limit.
     log_levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
     n_left_out = float(np.sum(weights == 0.0))
-    objective = fit.objective + 0.5 * n_left_out * (log_levels + _OUTLIER_SQUARED)
+    objective = fit.objective + 0.5 * n_left_out * (
+        log_levels + _OUTLIER_SQUARED
+    )
     return replace(fit, weights=weights, objective=objective)
 
 
@@ -307,7 +318,8 @@ def _variances(
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= _N_VALUES:
         places_m2 = (
-            se3.translation_of(stops.Ts_world_child).var(axis=0).sum() + MIN_VARIANCE
+            se3.translation_of(stops.Ts_world_child).var(axis=0).sum()
+            + MIN_VARIANCE
         )
         means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
     return np.maximum(means, MIN_VARIANCE)
@@ -373,11 +385,15 @@ def _fit(
         if converged:
             break
     # Expected information of the Student-t likelihood: Lange, Little, Taylor 1989, section 4.
-    rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[:, None, None]
+    rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[
+        :, None, None
+    ]
     fisher = _products(rows)[:-1, :-1]
     is_outlier = distances >= _OUTLIER_SQUARED
     log_tails = rests @ np.log1p(distances / degrees)
-    objective = 1.5 * n * np.log(variances).sum() + 0.5 * (degrees + 6.0) * log_tails
+    objective = (
+        1.5 * n * np.log(variances).sum() + 0.5 * (degrees + 6.0) * log_tails
+    )
     fit = RobotWorld(
         T_parent_child=X,
         T_world_world=Z,
@@ -494,14 +510,20 @@ def rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
     """
     errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world)
     predicted = (
-        se3.inverse(fit.T_world_world) @ stops.Ts_world_parent @ fit.T_parent_child
+        se3.inverse(fit.T_world_world)
+        @ stops.Ts_world_parent
+        @ fit.T_parent_child
     )
     by_length = np.zeros((len(stops), 6))
     by_length[:, :3] = se3.translation_of(se3.inverse(predicted))
-    return np.concatenate([jacobian, by_length[..., None], errors[..., None]], axis=2)
+    return np.concatenate(
+        [jacobian, by_length[..., None], errors[..., None]], axis=2
+    )
 
 
-def _stretch_of(rows: FloatArray, lasting: FloatArray, stretch: float) -> _Stretch:
+def _stretch_of(
+    rows: FloatArray, lasting: FloatArray, stretch: float
+) -> _Stretch:
     """Return the effect of an unknown scale of the child's lengths.
 
     Parameters
@@ -517,7 +539,9 @@ def _stretch_of(rows: FloatArray, lasting: FloatArray, stretch: float) -> _Stret
     products = rows.T @ rows + 1e-12 * size * np.eye(14)
     # Components of the scale's derivative, and of the errors along it, that X and Z cannot explain.
     by_length, by_errors = np.linalg.cholesky(products)[12:, 12]
-    direction = np.append(-np.linalg.solve(products[:12, :12], products[:12, 12]), 1.0)
+    direction = np.append(
+        -np.linalg.solve(products[:12, :12], products[:12, 12]), 1.0
+    )
     inflation = max(
         1.0 + float(direction @ lasting @ direction) / float(by_length**2), 1.0
     )

@@ -73,11 +73,15 @@ def check_frozen(poses: StopPoses) -> Iterator[Finding]:
         others = se3.rotation_of(getattr(poses, other))
         steps = se3.log(se3.inverse(own[:-1]) @ own[1:])
         is_repeated = np.abs(steps).max(axis=1) < _ROUNDING
-        turns_rad = se3.rotation_angle(se3.relative_rotations(others[:-1], others[1:]))
+        turns_rad = se3.rotation_angle(
+            se3.relative_rotations(others[:-1], others[1:])
+        )
         share = float(np.mean(is_repeated & (turns_rad > MIN_TURN_RAD)))
         if share == 0.0:
             continue
-        is_frozen_throughout = is_repeated.all() and median(turns_rad) > MIN_TURN_RAD
+        is_frozen_throughout = (
+            is_repeated.all() and median(turns_rad) > MIN_TURN_RAD
+        )
         share = 1.0 if is_frozen_throughout else min(share, 0.99)
         yield finding("frozen_stops", stream, share=share)
 
@@ -90,7 +94,9 @@ def check_rows(poses: StopPoses) -> Iterator[Finding]:
     best = ""
     smallest_rad = difference_rad / MIN_IMPROVEMENT
     for order in _usual_orders(len(of_parent)):
-        reordered_parent = of_parent[np.ix_(order.parent_rows, order.parent_rows)]
+        reordered_parent = of_parent[
+            np.ix_(order.parent_rows, order.parent_rows)
+        ]
         reordered_child = of_child[np.ix_(order.child_rows, order.child_rows)]
         reordered_rad = median_difference(reordered_parent, reordered_child)
         if reordered_rad < smallest_rad:
@@ -121,16 +127,22 @@ def _usual_orders(n: int) -> Iterator[_Order]:
         later = rows[shift:]
         earlier = rows[:-shift]
         yield _Order(f"if the child's are moved down {by_rows}", later, earlier)
-        yield _Order(f"if the parent's are moved down {by_rows}", earlier, later)
+        yield _Order(
+            f"if the parent's are moved down {by_rows}", earlier, later
+        )
     yield _Order(
-        "if those of one side are read from the last to the first", rows, rows[::-1]
+        "if those of one side are read from the last to the first",
+        rows,
+        rows[::-1],
     )
     for first in (0, 1):
         by_name = np.argsort([str(row + first) for row in rows], kind="stable")
         if np.array_equal(by_name, rows):
             continue
         names = "0, 1, 10, 11, ..., 2" if first == 0 else "1, 10, 11, ..., 2"
-        text = f"are sorted by name ({names}), those of the other side by number"
+        text = (
+            f"are sorted by name ({names}), those of the other side by number"
+        )
         yield _Order(f"if the child's {text}", by_name, rows)
         yield _Order(f"if the parent's {text}", rows, by_name)
 
@@ -234,9 +246,7 @@ def _vectors_of_one_sign(rotations: FloatArray) -> FloatArray:
 _VECTORS = "rotation vectors"
 _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
-_REVERSED = (
-    "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
-)
+_REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
 
 # For each kind of angles: the function from three numbers (N, 3) to rotations (N, 3, 3).
 _ROTATIONS_OF: dict[str, _Conversion] = {
@@ -285,11 +295,15 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
     of_parent = angles_between(sample.parent)
     of_child = angles_between(sample.child)
     difference_rad = median_difference(of_parent, of_child)
-    turn_rad = max(median(above_diagonal(of_parent)), median(above_diagonal(of_child)))
+    turn_rad = max(
+        median(above_diagonal(of_parent)), median(above_diagonal(of_child))
+    )
     are_equal = difference_rad < MAX_UNEXPLAINED * MIN_TURN_RAD
     if are_equal or difference_rad < SMALL_UNEXPLAINED * turn_rad:
         return
-    within_rad = min(difference_rad / MIN_IMPROVEMENT, MAX_UNEXPLAINED * turn_rad)
+    within_rad = min(
+        difference_rad / MIN_IMPROVEMENT, MAX_UNEXPLAINED * turn_rad
+    )
     kinds = [
         *_other_kinds(sample, "parent", of_child),
         *_other_kinds(sample, "child", of_parent),
@@ -305,7 +319,9 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
         chosen = min(best, key=lambda kind: kind.unexplained_share)
         yield finding("angles", chosen.stream, detail=chosen.text)
     elif difference_rad > MIN_TURN_RAD and _are_unrelated(of_parent, of_child):
-        yield finding("unrelated_stops", off_deg=float(np.degrees(difference_rad)))
+        yield finding(
+            "unrelated_stops", off_deg=float(np.degrees(difference_rad))
+        )
 
 
 def _other_kinds(
@@ -322,10 +338,15 @@ def _other_kinds(
             if meant != read_as:
                 text = f"{meant}, not {read_as}"
                 rotations = rotations_of(numbers_of(R))
-                yield _angle_kind(sample, stream, rotations, text, angles_of_other)
+                yield _angle_kind(
+                    sample, stream, rotations, text, angles_of_other
+                )
         if meant != _VECTORS:
             text = f"{meant}, not {_VECTORS}"
-            both = rotations_of(se3.rotation_log(R)), rotations_of(_long_vectors(R))
+            both = (
+                rotations_of(se3.rotation_log(R)),
+                rotations_of(_long_vectors(R)),
+            )
             rotations = _agreeing_rotations(both, angles_of_other)
             yield _angle_kind(sample, stream, rotations, text, angles_of_other)
 
@@ -341,7 +362,9 @@ def _angle_kind(
     positions = se3.translation_of(getattr(sample, stream))
     reread = se3.from_rotation_translation(rotations, positions)
     difference_rad = median_difference(angles_between(reread), angles_of_other)
-    return _AngleKind(difference_rad, stream, text, sample.with_side(stream, reread))
+    return _AngleKind(
+        difference_rad, stream, text, sample.with_side(stream, reread)
+    )
 
 
 def _agreeing_rotations(
@@ -361,13 +384,17 @@ def _agreeing_rotations(
     """
     n = len(angles_of_other)
     R = np.concatenate(both)
-    angles = angles_between(se3.from_rotation_translation(R, np.zeros((2 * n, 3))))
+    angles = angles_between(
+        se3.from_rotation_translation(R, np.zeros((2 * n, 3)))
+    )
     differences = np.abs(angles - np.tile(angles_of_other, (2, 2)))
     best = np.arange(n)
     smallest_rad = np.inf
     stops = np.unique(np.linspace(0, n - 1, _N_STARTING_STOPS).astype(np.int64))
     for start in (*stops, *(stops + n)):
-        rows = np.arange(n) + n * differences[start].reshape(2, n).argmin(axis=0)
+        rows = np.arange(n) + n * differences[start].reshape(2, n).argmin(
+            axis=0
+        )
         for _ in range(_MAX_CHOICE_ROUNDS):
             costs = np.median(differences[:, rows], axis=1)
             updated = np.arange(n) + n * costs.reshape(2, n).argmin(axis=0)

@@ -76,13 +76,17 @@ class StopPoses:
     def sample(self) -> "StopPoses":
         """Return at most ``MAX_COMPARED`` of the stops, evenly spread."""
         n = len(self)
-        rows = np.unique(np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64))
+        rows = np.unique(
+            np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64)
+        )
         return replace(self, parent=self.parent[rows], child=self.child[rows])
 
     def with_side(self, stream: str, Ts: FloatArray) -> "StopPoses":
         """Return the stops with other poses (N, 4, 4) of the parent or the child."""
         return (
-            replace(self, parent=Ts) if stream == "parent" else replace(self, child=Ts)
+            replace(self, parent=Ts)
+            if stream == "parent"
+            else replace(self, child=Ts)
         )
 
     def without(self, mistakes: "Mistakes", scale: float = 1.0) -> Stops:
@@ -166,7 +170,9 @@ def scaled(Ts: FloatArray, factor: float) -> FloatArray:
 def angles_between(Ts: FloatArray) -> FloatArray:
     """Return the angles (N, N) of the rotations between all pairs of stops, rad."""
     quats = se3.to_quat_xyzw(Ts)
-    return np.asarray(2.0 * np.arccos(np.clip(np.abs(quats @ quats.T), 0.0, 1.0)))
+    return np.asarray(
+        2.0 * np.arccos(np.clip(np.abs(quats @ quats.T), 0.0, 1.0))
+    )
 
 
 def above_diagonal(angles: FloatArray) -> FloatArray:
@@ -205,7 +211,9 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     if not poses.has_positions:
         return RoughFit(mistakes, rotation_share, 0.0)
     position_share, error_m, scale = _fit_positions(A, B, Z)
-    distance_m = (scale or 1.0) * median(np.linalg.norm(se3.translation_of(B), axis=1))
+    distance_m = (scale or 1.0) * median(
+        np.linalg.norm(se3.translation_of(B), axis=1)
+    )
     logs = np.log(max(error_rad, _TINY)) + np.log(max(error_m, _TINY))
     return RoughFit(
         mistakes=mistakes,
@@ -217,7 +225,9 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     )
 
 
-def _fit_rotations(R_A: FloatArray, R_B: FloatArray) -> tuple[float, FloatArray]:
+def _fit_rotations(
+    R_A: FloatArray, R_B: FloatArray
+) -> tuple[float, FloatArray]:
     """Return the median residual (rad) of ``R_A X = Z R_B``, and the rotation Z (3, 3)."""
     weights = np.ones(len(R_A))
     for _ in range(_MAX_ROUNDS):
@@ -225,7 +235,9 @@ def _fit_rotations(R_A: FloatArray, R_B: FloatArray) -> tuple[float, FloatArray]
         residuals = se3.relative_rotations(Z @ R_B, R_A) @ X
         angles_rad = se3.rotation_angle(residuals)
         error_rad = median(angles_rad)
-        weights = robust_weights("cauchy", (angles_rad / max(error_rad, _TINY)) ** 2)
+        weights = robust_weights(
+            "cauchy", (angles_rad / max(error_rad, _TINY)) ** 2
+        )
     return error_rad, Z
 
 
@@ -262,10 +274,14 @@ def _fit_positions(
     return error / max(spread(of_parent), spread(of_child), _TINY), error, None
 
 
-def _regression(rows: FloatArray, positions: FloatArray) -> tuple[float, FloatArray]:
+def _regression(
+    rows: FloatArray, positions: FloatArray
+) -> tuple[float, FloatArray]:
     """Return the median residual (m) of ``rows @ values = -positions``, and the values (k,).
 
     The regression is robust (Cauchy weights). ``rows`` (N, 3, k), ``positions`` (N, 3).
     """
-    values, lengths = robust_regression("cauchy", rows, -positions, _MAX_ROUNDS, median)
+    values, lengths = robust_regression(
+        "cauchy", rows, -positions, _MAX_ROUNDS, median
+    )
     return median(lengths), values

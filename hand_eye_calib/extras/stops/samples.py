@@ -64,7 +64,9 @@ _QUANTITIES = {
     "tvecs": "translation",
 }
 _OPENCV_FRAMES = {
-    **dict.fromkeys(("gripper", "hand", "ee", "eef", "flange", "tool", "tcp"), "hand"),
+    **dict.fromkeys(
+        ("gripper", "hand", "ee", "eef", "flange", "tool", "tcp"), "hand"
+    ),
     **dict.fromkeys(("base", "robot"), "base"),
     **dict.fromkeys(
         ("target", "world", "board", "marker", "tag", "object", "obj"), "target"
@@ -151,7 +153,9 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     if document is None:
         raise InputError(f"{path}: the file is empty; expected {_EXPECTED}")
     with located(path):
-        samples = _opencv_samples(document) if isinstance(document, Mapping) else None
+        samples = (
+            _opencv_samples(document) if isinstance(document, Mapping) else None
+        )
         if is_npz:
             samples = samples or _stacked_samples(document)
     return samples or _listed_samples(path, document)
@@ -173,7 +177,9 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
             poses.append([pose_of(value) for value in _both_poses(sample)])
     robot, tracking = np.swapaxes(poses, 0, 1)
     frames = {
-        name: parameters[key] for name, key in _FRAMES.items() if parameters.get(key)
+        name: parameters[key]
+        for name, key in _FRAMES.items()
+        if parameters.get(key)
     }
     setup = _SETUPS.get(str(parameters.get(_TYPE)))
     # For a camera beside the robot, easy_handeye stores the pose of the base in the hand.
@@ -198,7 +204,9 @@ def _samples_in(path: str | Path, document: Any) -> list[Any]:
                 "streams again"
             )
         has_list = "samples" in document
-        samples = document["samples"] if has_list else [*_numbered_pairs(document)]
+        samples = (
+            document["samples"] if has_list else [*_numbered_pairs(document)]
+        )
     if not isinstance(samples, list) or not samples:
         empty = "the list of samples is empty; " if samples == [] else ""
         raise InputError(f"{path}: {empty}expected {_EXPECTED}")
@@ -207,7 +215,9 @@ def _samples_in(path: str | Path, document: Any) -> list[Any]:
 
 def _parameters_of(document: Any) -> Mapping[str, Any]:
     """Return the parameters of a document of easy_handeye: names of frames, type of calibration."""
-    parameters = document.get("parameters") if isinstance(document, Mapping) else None
+    parameters = (
+        document.get("parameters") if isinstance(document, Mapping) else None
+    )
     return parameters if isinstance(parameters, Mapping) else {}
 
 
@@ -229,7 +239,9 @@ def _stacked_samples(stacks: Mapping[str, FloatArray]) -> ArmSamples:
         if {*names} <= stacks.keys():
             robot, tracking = (pose_stack(stacks[name], name) for name in names)
             return ArmSamples(robot, tracking, {})
-    raise InputError(f"expected {_EXPECTED}; found {', '.join(stacks) or 'nothing'}")
+    raise InputError(
+        f"expected {_EXPECTED}; found {', '.join(stacks) or 'nothing'}"
+    )
 
 
 def _numbered_pairs(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
@@ -244,7 +256,9 @@ def _numbered_pairs(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
 def _both_poses(sample: Any) -> Sequence[Any]:
     """Return both poses of a sample, the robot's first."""
     if isinstance(sample, Mapping):
-        names = next((names for names in _NAMES if {*names} <= sample.keys()), ())
+        names = next(
+            (names for names in _NAMES if {*names} <= sample.keys()), ()
+        )
         if not names:
             _refuse_half_sample(sample)
         sample = [sample[name] for name in names]
@@ -276,7 +290,10 @@ def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
         match = _OPENCV_NAME.fullmatch(name)
         if match is None or match[1] not in _QUANTITIES:
             continue
-        frames = _OPENCV_FRAMES.get(match[2], ""), _OPENCV_FRAMES.get(match[3], "")
+        frames = (
+            _OPENCV_FRAMES.get(match[2], ""),
+            _OPENCV_FRAMES.get(match[3], ""),
+        )
         transforms.setdefault(frames, {})[_QUANTITIES[match[1]]] = value
     robot = _opencv_poses(transforms, "hand", "base")
     tracking = _opencv_poses(transforms, "target", "camera")
@@ -286,7 +303,9 @@ def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
 
 
 def _opencv_poses(
-    transforms: Mapping[tuple[str, str], Mapping[str, Any]], source: str, target: str
+    transforms: Mapping[tuple[str, str], Mapping[str, Any]],
+    source: str,
+    target: str,
 ) -> FloatArray | None:
     """Return the poses (N, 4, 4) of frame ``source`` in frame ``target``; None if missing.
 

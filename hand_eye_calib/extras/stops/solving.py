@@ -87,7 +87,9 @@ class SolvedStops:
 
     def adding(self, *findings: Finding) -> "SolvedStops":
         """Return a copy with further findings."""
-        return replace(self, findings=gravest_first((*self.findings, *findings)))
+        return replace(
+            self, findings=gravest_first((*self.findings, *findings))
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,9 @@ def inversions_in_words(config: CalibratorConfig) -> str:
     sides = {"parent_invert": "robot", "child_invert": "target"}
     given = [name for name in sides if getattr(config, name) == "poses"]
     others = [
-        f"{name} poses ({side})" for name, side in sides.items() if name not in given
+        f"{name} poses ({side})"
+        for name, side in sides.items()
+        if name not in given
     ]
     if not given:
         return f"give {', '.join(others)}, or both"
@@ -177,7 +181,10 @@ def solve_checked(
         scale_sigma=repaired.unit * setup_fit.scale_sigma,
     )
     return SolvedStops(
-        setup_fit, repaired.config, gravest_first(findings), tuple(repaired.warnings)
+        setup_fit,
+        repaired.config,
+        gravest_first(findings),
+        tuple(repaired.warnings),
     )
 
 
@@ -187,7 +194,9 @@ def solve_checked(
 def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
     """Check stops, and repair certain mistakes unless the user set the option."""
     is_scale_free = config.scale in ("auto", "estimate")
-    examination = examine(_in_metres(poses, config, config.given_scale), is_scale_free)
+    examination = examine(
+        _in_metres(poses, config, config.given_scale), is_scale_free
+    )
     # If the scale is estimated, it contains the unit of the child's lengths.
     unit = config.given_scale * examination.child_unit
     findings, repairs = _with_user_options(examination, config)
@@ -201,7 +210,9 @@ def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
         config = replace(config, **options)
         unit = float(options.get("scale", unit))
     poses = _in_metres(poses, config, unit)
-    return _Repaired(poses, config, unit, rough_scale or 1.0, findings, warnings)
+    return _Repaired(
+        poses, config, unit, rough_scale or 1.0, findings, warnings
+    )
 
 
 def _in_metres(
@@ -211,8 +222,12 @@ def _in_metres(
 
     ``child_unit`` is the factor from the child's lengths to metres.
     """
-    parent = se3.put_right(poses.parent, config.parent_invert, config.parent_quaternion)
-    child = se3.put_right(poses.child, config.child_invert, config.child_quaternion)
+    parent = se3.put_right(
+        poses.parent, config.parent_invert, config.parent_quaternion
+    )
+    child = se3.put_right(
+        poses.child, config.child_invert, config.child_quaternion
+    )
     return replace(
         poses,
         parent=scaled(parent, config.parent_scale),
@@ -236,7 +251,9 @@ def _with_user_options(
         elif not is_decided:
             findings.append(issue)
     settled_codes = {
-        issue.code for issue in examination.repairs if {*issue.options} & config.given
+        issue.code
+        for issue in examination.repairs
+        if {*issue.options} & config.given
     }
     repairs = []
     for issue in examination.repairs:
@@ -269,20 +286,26 @@ def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
     return replace(issue, options=options)
 
 
-def _options_of(repairs: Sequence[Finding], config: CalibratorConfig) -> dict[str, Any]:
+def _options_of(
+    repairs: Sequence[Finding], config: CalibratorConfig
+) -> dict[str, Any]:
     """Return the options of all repairs; ``parent_scale`` includes the factor of the user."""
     options: dict[str, Any] = {}
     for repair in repairs:
         options |= repair.options
     if "parent_scale" in options:
-        options["parent_scale"] = float(options["parent_scale"]) * config.parent_scale
+        options["parent_scale"] = (
+            float(options["parent_scale"]) * config.parent_scale
+        )
     return options
 
 
 # ------------------------------------------------------------------ setup and scale
 
 
-def _likelier_setup(poses: StopPoses, scale: float, setup: str | None) -> SetupFit:
+def _likelier_setup(
+    poses: StopPoses, scale: float, setup: str | None
+) -> SetupFit:
     """Return the fit of the likelier setup, or of the setup that the user chose.
 
     ``scale`` is a factor of the child's lengths.
@@ -323,7 +346,9 @@ def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
             break
         scale *= 1.0 + float(np.clip(fit.scale_step, -0.5, 1.0))
     sigma = scale * fit.scale_sigma
-    return replace(setup_fit, fit=fit, stops=stops, scale=scale, scale_sigma=sigma)
+    return replace(
+        setup_fit, fit=fit, stops=stops, scale=scale, scale_sigma=sigma
+    )
 
 
 def _with_checked_scale(
@@ -407,10 +432,16 @@ def _check_unknown(
     The cause is that the stops rotate about one axis only, or that they contradict each other.
     """
     if not turns_about_two_axes(poses.parent):
-        return [finding("turning_about_one_axis")] if poses.has_positions else []
+        return (
+            [finding("turning_about_one_axis")] if poses.has_positions else []
+        )
     rotations = se3.rotation_of(poses.parent)
     turn_rad = median(se3.rotation_angle(rotations[0].T @ rotations))
-    if has_error(findings) or not fit.undetermined().size or turn_rad < _LARGE_TURN_RAD:
+    if (
+        has_error(findings)
+        or not fit.undetermined().size
+        or turn_rad < _LARGE_TURN_RAD
+    ):
         return []
     share = min(float(np.sqrt(3.0)) * fit.level_rad / turn_rad, 1.0)
     return [finding("disagreeing_stops", part="rotations", share=share)]

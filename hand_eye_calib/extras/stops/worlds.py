@@ -86,7 +86,9 @@ class WorldsPart(Part):
         return Worlds(
             T_world_world=transform_of(document["T_world_world"]),
             cov_world_world=covariance_of(document["cov_world_world"]),
-            **{name: from_plain(str, document.get(name, "")) for name in _TEXTS},
+            **{
+                name: from_plain(str, document.get(name, "")) for name in _TEXTS
+            },
         )
 
     def invert(self, value: Worlds) -> Worlds:

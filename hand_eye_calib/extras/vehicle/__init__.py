@@ -34,8 +34,17 @@ def register() -> None:
     The registered functions import their modules only when they are called.
     """
     needs = "wheels need the poses of a sensor"
-    for word in ("wheels", "wheel_odometry", "steering", "tricycle", "omni", "driving"):
-        MEASURES[word] = Measure("vehicle", needs, read_as="poses", is_parent=True)
+    for word in (
+        "wheels",
+        "wheel_odometry",
+        "steering",
+        "tricycle",
+        "omni",
+        "driving",
+    ):
+        MEASURES[word] = Measure(
+            "vehicle", needs, read_as="poses", is_parent=True
+        )
     OUT_OF_REACH["vehicle"] = ("z",)
     OUT_OF_REACH["vehicle_2d"] = ("z", "roll", "pitch")
     OUT_OF_REACH["vehicle_alone"] = ("y", "z")
@@ -49,8 +58,12 @@ def register() -> None:
     BAG_READINGS["sensor_msgs/msg/JointState"] = _joint_states
     for message_type in _LIVE_TYPES:
         LIVE_READINGS[message_type] = partial(_live, message_type)
-    PUBLIC_NAMES["calibrate_vehicle"] = "hand_eye_calib.extras.vehicle.calibrate"
-    PUBLIC_NAMES["wheel_trajectory"] = "hand_eye_calib.extras.vehicle.wheel_files"
+    PUBLIC_NAMES["calibrate_vehicle"] = (
+        "hand_eye_calib.extras.vehicle.calibrate"
+    )
+    PUBLIC_NAMES["wheel_trajectory"] = (
+        "hand_eye_calib.extras.vehicle.wheel_files"
+    )
     ROUTES["vehicle"] = Route(_add_arguments, _is_alone, _calibrate)
 
 

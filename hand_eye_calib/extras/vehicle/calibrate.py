@@ -61,7 +61,9 @@ def _driving(sensor: Trajectory) -> Trajectory:
     Its kind of data, "driving", means that only the limits of a vehicle's motion are used, not the
     poses of the stream.
     """
-    return replace(sensor, sensor_frame="base_link", world_frame="", measures="driving")
+    return replace(
+        sensor, sensor_frame="base_link", world_frame="", measures="driving"
+    )
 
 
 def calibrate_alone(arguments: Namespace) -> int:

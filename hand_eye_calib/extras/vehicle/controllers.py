@@ -38,7 +38,9 @@ class Controller(NamedTuple):
 
 def _of_two_wheels(wheels: VehicleParameters) -> Controller:
     """Return the parameters for the rates of two driven wheels."""
-    left, right, separation = (parameter.value for parameter in wheels.parameters)
+    left, right, separation = (
+        parameter.value for parameter in wheels.parameters
+    )
     values = {}
     remarks = []
     if wheels.is_factor:
@@ -64,7 +66,9 @@ def _of_odometry(wheels: VehicleParameters) -> Controller:
 
     A curvature c is a difference of both radii: c = 2 (R_r - R_l) / ((R_r + R_l) B).
     """
-    radius, separation, curvature = (parameter.value for parameter in wheels.parameters)
+    radius, separation, curvature = (
+        parameter.value for parameter in wheels.parameters
+    )
     half = 0.5 * curvature * radius * separation * wheels.nominal_separation_m
     remarks = [
         "Multiply the values with which the odometry was recorded by these factors"
@@ -84,7 +88,9 @@ def _of_odometry(wheels: VehicleParameters) -> Controller:
 
 def _of_steering(wheels: VehicleParameters) -> Controller:
     """Return the parameters for the speed of the fixed axle and a steering angle."""
-    return _steered("ackermann_steering_controller", "traction_wheels_radius", wheels)
+    return _steered(
+        "ackermann_steering_controller", "traction_wheels_radius", wheels
+    )
 
 
 def _of_tricycle(wheels: VehicleParameters) -> Controller:
@@ -92,16 +98,22 @@ def _of_tricycle(wheels: VehicleParameters) -> Controller:
     return _steered("tricycle_controller", "wheel_radius", wheels)
 
 
-def _steered(name: str, radius_name: str, wheels: VehicleParameters) -> Controller:
+def _steered(
+    name: str, radius_name: str, wheels: VehicleParameters
+) -> Controller:
     """Return the parameters of a controller with a steering angle."""
-    radius, wheelbase, offset = (parameter.value for parameter in wheels.parameters)
+    radius, wheelbase, offset = (
+        parameter.value for parameter in wheels.parameters
+    )
     values = {"wheelbase": wheelbase}
     remarks = [
         f"The measured steering angle is {fixed(offset, _DECIMALS)} rad too large. The controller "
         "has no parameter for this: subtract it in the driver"
     ]
     if wheels.is_factor:
-        remarks.append(f"{radius_name}: multiply yours by {fixed(radius, _DECIMALS)}")
+        remarks.append(
+            f"{radius_name}: multiply yours by {fixed(radius, _DECIMALS)}"
+        )
     else:
         values[radius_name] = radius
     return Controller(name, values, remarks)
@@ -112,7 +124,9 @@ def _of_omni(wheels: VehicleParameters) -> Controller:
     forward, left, turn = (parameter.value for parameter in wheels.parameters)
     length = "kinematics.sum_of_robot_center_projection_on_X_Y_axis"
     values = {}
-    remarks = [f"{length}: multiply yours by {fixed(forward / turn, _DECIMALS)}"]
+    remarks = [
+        f"{length}: multiply yours by {fixed(forward / turn, _DECIMALS)}"
+    ]
     if wheels.nominal_radius_m:
         values["kinematics.wheels_radius"] = forward * wheels.nominal_radius_m
     else:
@@ -156,7 +170,10 @@ def controller_text(wheels: VehicleParameters, headline: str) -> str:
     ]
     comments = "".join(f"# {line}\n" for line in lines)
     parameters = {
-        name: round(value, _DECIMALS) for name, value in controller.values.items()
+        name: round(value, _DECIMALS)
+        for name, value in controller.values.items()
     }
     document = {controller.name: {"ros__parameters": parameters}}
-    return comments + (yaml.safe_dump(document, sort_keys=False) if parameters else "")
+    return comments + (
+        yaml.safe_dump(document, sort_keys=False) if parameters else ""
+    )

@@ -36,10 +36,16 @@ class JointStateReading(Reading):
 
     def take(self, run: Run) -> None:
         """Read the next messages; raise InputError if their wheels are unclear."""
-        for message, bag_ns in zip(run.decoded(), run.bag_ns.tolist(), strict=True):
-            row = self._joints.row([*message.name], message.position, message.velocity)
+        for message, bag_ns in zip(
+            run.decoded(), run.bag_ns.tolist(), strict=True
+        ):
+            row = self._joints.row(
+                [*message.name], message.position, message.velocity
+            )
             if row is not None:
-                self._rows.append((ns_of(message.header.stamp) or 0, bag_ns, row))
+                self._rows.append(
+                    (ns_of(message.header.stamp) or 0, bag_ns, row)
+                )
 
     def table(self) -> PoseTable:
         """Return the path of the unit vehicle; raise InputError if no message has wheels."""
@@ -49,7 +55,9 @@ class JointStateReading(Reading):
                 f"{self.name}: no message has wheels; {self._joints.expected}"
             )
         words = (
-            ("wheels", "steering") if self._measures in STEERED else ("left", "right")
+            ("wheels", "steering")
+            if self._measures in STEERED
+            else ("left", "right")
         )
         self.notes.append(
             f"{self.name}: {words[0]} {listing(joints.first)}, {words[1]} {listing(joints.second)}"
@@ -58,7 +66,9 @@ class JointStateReading(Reading):
         values = np.array(rows)
         bag_times_ns = np.array(bag_ns, dtype=np.int64)
         is_received = self.stamps == "receive"
-        stamps_ns = bag_times_ns if is_received else np.array(stamps, dtype=np.int64)
+        stamps_ns = (
+            bag_times_ns if is_received else np.array(stamps, dtype=np.int64)
+        )
         is_used = self._usable(values, stamps_ns)
         stamps_ns = stamps_ns[is_used]
         means = self._joints.means(stamps_ns, values[is_used])

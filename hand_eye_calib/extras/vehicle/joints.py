@@ -70,7 +70,11 @@ class WheelJoints:
     def _named(self, names: str) -> Joints:
         """Return the joints that the user names."""
         groups = names.split(",")
-        if "+" not in names and self._measures == "wheels" and len(groups) % 2 == 0:
+        if (
+            "+" not in names
+            and self._measures == "wheels"
+            and len(groups) % 2 == 0
+        ):
             half = len(groups) // 2
             return Joints(tuple(groups[:half]), tuple(groups[half:]))
         if len(groups) != 2:
@@ -102,9 +106,10 @@ class WheelJoints:
             If the joints of the wheels are unclear.
         """
         self.joints = self.joints or self._found(names)
-        if self.joints is None or not {*self.joints.first, *self.joints.second} <= {
-            *names
-        }:
+        if self.joints is None or not {
+            *self.joints.first,
+            *self.joints.second,
+        } <= {*names}:
             # Other joints may be published on the same topic.
             return None
         self.are_positions = not len(velocities)
@@ -147,13 +152,18 @@ class WheelJoints:
                 "wheel drives"
             )
         left = tuple(name for name in wheels if re.search(_LEFT, name.lower()))
-        right = tuple(name for name in wheels if re.search(_RIGHT, name.lower()))
+        right = tuple(
+            name for name in wheels if re.search(_RIGHT, name.lower())
+        )
         if not left or len(left) != len(right):
             raise self._unclear(names)
         return Joints(left, right)
 
     def _steered(
-        self, names: Sequence[str], wheels: Sequence[str], steered: tuple[str, ...]
+        self,
+        names: Sequence[str],
+        wheels: Sequence[str],
+        steered: tuple[str, ...],
     ) -> Joints:
         """Return the driven wheels, and the joints with the steering angle.
 
@@ -192,7 +202,9 @@ class WheelJoints:
             # The second column is a steering angle, or the angle of a wheel.
             n_wheels = 1 if self._measures in STEERED else 2
             durations_s = np.diff(stamps_ns)[:, None] * 1e-9
-            means[:, :n_wheels] = np.diff(rows[:, :n_wheels], axis=0) / durations_s
+            means[:, :n_wheels] = (
+                np.diff(rows[:, :n_wheels], axis=0) / durations_s
+            )
         return means
 
 

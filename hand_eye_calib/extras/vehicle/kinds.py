@@ -33,7 +33,10 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, Residuals
-from hand_eye_calib.extras.vehicle.parameters import VehicleParameter, VehicleParameters
+from hand_eye_calib.extras.vehicle.parameters import (
+    VehicleParameter,
+    VehicleParameters,
+)
 from hand_eye_calib.extras.vehicle.solving import (
     BLOCKS,
     CLOCK,
@@ -142,7 +145,9 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     wheels, _ = snapshot.streams
     pairs = snapshot.pose_pairs
     offset_s = config.given_time_offset_s
-    window_s = _WINDOW_ALONE_S if config.parent_measures == "driving" else _WINDOW_S
+    window_s = (
+        _WINDOW_ALONE_S if config.parent_measures == "driving" else _WINDOW_S
+    )
     if "time_offset" not in config.given and snapshot.correlation.is_clear:
         offset_s = snapshot.correlation.offset_s
     drive = _drive(pairs, wheels, config, offset_s, window_s)
@@ -331,7 +336,9 @@ def _is_usual_radius(wheels: VehicleParameters) -> bool:
         if parameter.name in _LENGTHS:
             lowest, highest = _USUAL_RADII
             return (
-                lowest * parameter.value <= wheels.radius <= highest * parameter.value
+                lowest * parameter.value
+                <= wheels.radius
+                <= highest * parameter.value
             )
     return True
 
@@ -374,9 +381,9 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
     """
     residuals = np.zeros(drive.xi.shape)
     residuals[:, drive.components] = fit.residuals
-    window_start_ns, window_end_ns = start_ns + np.round(drive.ends_s * 1e9).astype(
-        np.int64
-    )
+    window_start_ns, window_end_ns = start_ns + np.round(
+        drive.ends_s * 1e9
+    ).astype(np.int64)
     return Residuals(
         translation=residuals[:, :3],
         rotation=residuals[:, 3:] @ se3.rotation_of(fit.T_base_sensor),
@@ -386,7 +393,9 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
     )
 
 
-def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Finding, ...]:
+def _check_fit(
+    fit: Fit, drive: Drive, config: CalibratorConfig
+) -> tuple[Finding, ...]:
     """Return the finding about a fit, if there is one.
 
     It detects drives that do not determine the pose, wheels that are those of another drive,
@@ -412,7 +421,11 @@ def _check_fit(fit: Fit, drive: Drive, config: CalibratorConfig) -> tuple[Findin
         for axis, index in index_of.items()
         if differences[index] > _MAX_SIGMAS_OF_HALVES
     ]
-    return (finding("vehicle_halves", axes=listing(different)),) if different else ()
+    return (
+        (finding("vehicle_halves", axes=listing(different)),)
+        if different
+        else ()
+    )
 
 
 def _undetermined_axes(
@@ -440,7 +453,9 @@ def _check_wheels(
         return (finding("unrelated_wheels", severity=severity),)
     has_prior = bool({"roll", "pitch"} & {*config.prior()})
     if not has_prior and _is_upside_down(fit):
-        roll = np.degrees(se3.rotation_to_rpy(se3.rotation_of(fit.T_base_sensor))[0])
+        roll = np.degrees(
+            se3.rotation_to_rpy(se3.rotation_of(fit.T_base_sensor))[0]
+        )
         return (finding("upside_down", roll=f"{roll:.0f}"),)
     return ()
 
@@ -449,7 +464,9 @@ def _is_upside_down(fit: Fit) -> bool:
     """Whether z of the sensor, or -y of a camera, points down."""
     up = se3.rotation_of(fit.T_base_sensor)[2]
     main = int(np.argmax(np.abs(up)))
-    return bool(up[2] < 0.0 if main == 2 else up[1] > 0.0 if main == 1 else False)
+    return bool(
+        up[2] < 0.0 if main == 2 else up[1] > 0.0 if main == 1 else False
+    )
 
 
 def _has_varied_turns(drive: Drive) -> bool:
@@ -459,7 +476,9 @@ def _has_varied_turns(drive: Drive) -> bool:
     curvature = lengths @ turns / (lengths @ lengths)
     deviations = turns - curvature * lengths
     is_large = np.mean(deviations**2) > _VARIED_SHARE**2 * np.mean(turns**2)
-    return bool(is_large and quantile(np.abs(deviations), _USUAL) > _VARIED_TURN)
+    return bool(
+        is_large and quantile(np.abs(deviations), _USUAL) > _VARIED_TURN
+    )
 
 
 def _is_on_the_spot(drive: Drive) -> bool:
@@ -480,10 +499,14 @@ def _unrelated_share(fit: Fit, drive: Drive) -> float:
     return float(max(shares[0], shares[-1]))
 
 
-def _check(snapshot: Snapshot, calibration: Calibration | None = None) -> CheckResult:
+def _check(
+    snapshot: Snapshot, calibration: Calibration | None = None
+) -> CheckResult:
     """Return the findings about the calibration and about the stream of the sensor."""
     findings = [*calibration.findings] if calibration else []
-    findings += check_stream(snapshot.streams[1], "child", snapshot.config.max_gap)
+    findings += check_stream(
+        snapshot.streams[1], "child", snapshot.config.max_gap
+    )
     return CheckResult(gravest_first(findings))
 
 

@@ -54,7 +54,10 @@ class LiveReading(ABC):
         self, earlier: Sequence[float], later: Sequence[float], _: float
     ) -> list[float]:
         """Return the wheel data between two messages, which are some seconds apart."""
-        return [(start + end) / 2.0 for start, end in zip(earlier, later, strict=True)]
+        return [
+            (start + end) / 2.0
+            for start, end in zip(earlier, later, strict=True)
+        ]
 
     def __call__(self, data: bytes) -> PoseFields:
         """Return the pose after the next message, in CDR.
@@ -72,7 +75,9 @@ class LiveReading(ABC):
             world_frame = cursor.name()
             values = self._read(cursor)
         except MALFORMED as error:
-            raise InputError(f"not a message with velocities: {error}") from error
+            raise InputError(
+                f"not a message with velocities: {error}"
+            ) from error
         if not all(map(math.isfinite, values)):
             raise NoPoseError("a value of the message is missing")
         duration_s = (stamp_ns - self._stamp_ns) * 1e-9
@@ -93,7 +98,8 @@ class LiveReading(ABC):
     def _drive(self, means: Sequence[float], duration_s: float) -> None:
         """Continue the path by one arc; ``means`` are the wheel data of the duration."""
         forward, left, turn = (
-            float(rate) * duration_s for rate in unit_rates(self.measures, means)
+            float(rate) * duration_s
+            for rate in unit_rates(self.measures, means)
         )
         if abs(turn) > math.pi:
             raise InputError(
@@ -112,7 +118,11 @@ class LiveTwists(LiveReading):
 
     def _read(self, cursor: Cursor) -> Sequence[float]:
         forward, left, _, _, _, turn = cursor.read("6d")
-        return (forward, left, turn) if self.measures == "omni" else (forward, turn)
+        return (
+            (forward, left, turn)
+            if self.measures == "omni"
+            else (forward, turn)
+        )
 
 
 class LiveJoints(LiveReading):
@@ -137,7 +147,10 @@ class LiveJoints(LiveReading):
         return row
 
     def _mean(
-        self, earlier: Sequence[float], later: Sequence[float], duration_s: float
+        self,
+        earlier: Sequence[float],
+        later: Sequence[float],
+        duration_s: float,
     ) -> list[float]:
         means = super()._mean(earlier, later, duration_s)
         if self._joints.are_positions:

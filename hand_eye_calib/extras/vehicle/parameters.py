@@ -42,13 +42,17 @@ class VehicleParameters:
 
     def __getitem__(self, name: str) -> VehicleParameter:
         """Return a parameter by its name."""
-        return {parameter.name: parameter for parameter in self.parameters}[name]
+        return {parameter.name: parameter for parameter in self.parameters}[
+            name
+        ]
 
     @property
     def radius(self) -> float:
         """Mean radius of the wheels (m) or its factor; 0 for odometry, which has multipliers."""
         radii = [
-            item.value for item in self.parameters if item.name.endswith("wheel_radius")
+            item.value
+            for item in self.parameters
+            if item.name.endswith("wheel_radius")
         ]
         return sum(radii) / len(radii) if radii else 0.0
 

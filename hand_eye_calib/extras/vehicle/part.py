@@ -8,7 +8,12 @@ from hand_eye_calib.extras.vehicle.controllers import controller_text
 from hand_eye_calib.extras.vehicle.parameters import VehicleParameters
 
 # Units of parameters, by the last word of their names. Other parameters are written without a unit.
-_UNITS = {"separation": " m", "wheelbase": " m", "offset": " rad", "curvature": " 1/m"}
+_UNITS = {
+    "separation": " m",
+    "wheelbase": " m",
+    "offset": " rad",
+    "curvature": " 1/m",
+}
 
 
 class WheelPart(Part):

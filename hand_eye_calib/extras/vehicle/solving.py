@@ -175,7 +175,9 @@ class Drive:
         forward, left, turns = self.model.steps_of(others[2:], *self.steps)
         speeds = forward / np.diff(self.stamps_s)
         steps = np.stack([forward, left - slip * speeds**2 * turns, turns])
-        predicted[:, [0, 1, 5]] = motions(self.stamps_s, steps, self.ends_s + clock_s).T
+        predicted[:, [0, 1, 5]] = motions(
+            self.stamps_s, steps, self.ends_s + clock_s
+        ).T
         return predicted
 
     def rows(self, T: FloatArray, others: FloatArray) -> FloatArray:
@@ -191,7 +193,9 @@ class Drive:
             # The prediction of the wheels does not depend on the pose.
             if self.model is None or index >= CLOCK:
                 predicted = self.predicted(new_T, new_others)
-            columns.append((predicted - self.measured(new_T) - residuals) / _STEP)
+            columns.append(
+                (predicted - self.measured(new_T) - residuals) / _STEP
+            )
         return np.stack([*columns, -residuals], axis=-1)[:, self.components]
 
 
@@ -201,7 +205,9 @@ def apply_step(
     """Return the pose and the other unknowns after a step (U,) of all unknowns."""
     rotation = se3.rotation_exp(step[Y + 1 : CLOCK]) @ se3.rotation_of(T)
     translation = se3.translation_of(T) + np.append(step[: Y + 1], 0.0)
-    return se3.from_rotation_translation(rotation, translation), others + step[CLOCK:]
+    return se3.from_rotation_translation(rotation, translation), others + step[
+        CLOCK:
+    ]
 
 
 @dataclass(frozen=True)
@@ -251,7 +257,9 @@ class Fit:
         Noise of the turns looks like turning of the vehicle. Its information makes x and y too
         small, by the inverse of this multiple. ``components`` are those of the drive.
         """
-        variances = dict(zip(components, np.diag(self.noise).tolist(), strict=True))
+        variances = dict(
+            zip(components, np.diag(self.noise).tolist(), strict=True)
+        )
         left = variances[1]
         forward = variances.get(0, left)
         # Without wheels, the noise of turns is not known: use that of roll.
@@ -282,7 +290,10 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     fit = _solve(drive, T, others, sigmas)
     covariance = fit.covariance
     alternatives = [
-        (_solve(longer, T, others, sigmas), np.full(len(sigmas), _SHARE_OF_LONGER)),
+        (
+            _solve(longer, T, others, sigmas),
+            np.full(len(sigmas), _SHARE_OF_LONGER),
+        ),
         (
             _solve(drive, T, others, sigmas, is_weighted=False),
             _shares_of_unweighted(drive, fit),
@@ -290,7 +301,10 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     ]
     for alternative, shares in alternatives:
         difference = shares * _difference(
-            alternative.T_base_sensor, alternative.others, fit.T_base_sensor, fit.others
+            alternative.T_base_sensor,
+            alternative.others,
+            fit.T_base_sensor,
+            fit.others,
         )
         covariance = covariance + np.outer(difference, difference)
     ratios = fit.signal_to_noise(drive.components)
@@ -352,14 +366,17 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
         # Squared size (K,) of the effect of a slip of 100 %, in standard deviations of the noise.
         effect = fit.others[index - CLOCK] * columns[..., index]
         squared = (
-            np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect) + _MIN_VARIANCE
+            np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect)
+            + _MIN_VARIANCE
         )
         # Mean and standard deviation of a non-central chi-squared distribution, (3, K).
         excess = _SLIPS[:, None] ** 2 * squared
         mean = n_components + excess
         sigma = np.sqrt(2.0 * (n_components + 2.0 * excess))
         # The hyperbolic tangent is a logistic function that does not overflow.
-        is_kept = 0.5 - 0.5 * np.tanh(_LOGISTIC * (mean - threshold) / sigma / 2.0)
+        is_kept = 0.5 - 0.5 * np.tanh(
+            _LOGISTIC * (mean - threshold) / sigma / 2.0
+        )
         weights = is_kept * (STUDENT + n_components) / (STUDENT + mean)
         undetected = (
             np.average(weights, axis=1, weights=squared) @ _SLIPS / _SLIPS.sum()
@@ -394,7 +411,10 @@ def _lateral_acceleration(drive: Drive, T: FloatArray) -> float:
 
 
 def _difference(
-    T: FloatArray, others: FloatArray, from_T: FloatArray, from_others: FloatArray
+    T: FloatArray,
+    others: FloatArray,
+    from_T: FloatArray,
+    from_others: FloatArray,
 ) -> FloatArray:
     """Return the step (U,) that leads from the estimate ``from_...`` to the other estimate."""
     turn = se3.rotation_log(se3.rotation_of(T) @ se3.rotation_of(from_T).T)
@@ -438,13 +458,19 @@ def _solve(
         whitening = np.linalg.cholesky(inverse(noise)).T
         weighted = np.sqrt(weights)[:, None, None] * (whitening @ rows)
         blocks = Blocks.of_rows(weighted, BLOCKS)
-        prior[:-1, -1] = -_difference(T, others, start, first_others) / sigmas**2
+        prior[:-1, -1] = (
+            -_difference(T, others, start, first_others) / sigmas**2
+        )
         table = blocks.total + prior
         step = solve(table, everything)
         T, others = apply_step(T, others, step)
-        model = inverse(table[:-1, :-1])  # covariance (U, U) if windows are independent
+        model = inverse(
+            table[:-1, :-1]
+        )  # covariance (U, U) if windows are independent
         sigmas_of_step = np.sqrt(np.diag(model))
-        converged = bool((np.abs(step) < _STEP_SIGMAS * sigmas_of_step + _STEP).all())
+        converged = bool(
+            (np.abs(step) < _STEP_SIGMAS * sigmas_of_step + _STEP).all()
+        )
         if converged:
             break
     spread = _tapered_jackknife(Blocks.of_rows(weighted, len(weighted)), prior)
@@ -493,7 +519,9 @@ def _tapered_jackknife(windows: Blocks, prior: FloatArray) -> FloatArray:
     return np.asarray(deviations.T @ deviations)
 
 
-def _concentration(blocks: Blocks, prior: FloatArray, model: FloatArray) -> FloatArray:
+def _concentration(
+    blocks: Blocks, prior: FloatArray, model: FloatArray
+) -> FloatArray:
     """Return the concentration (U,) of a fit, see :class:`Fit`.
 
     ``prior`` are the products of the prior equations, and ``model`` is the covariance (U, U).
@@ -519,13 +547,17 @@ def _weights(
     n_windows, n_components = residuals.shape
     minimum = _MIN_VARIANCE * np.eye(n_components)
     if not noise.size:
-        noise = np.diag(np.median(residuals**2, axis=0) / CHI2[0.5][1]) + minimum
+        noise = (
+            np.diag(np.median(residuals**2, axis=0) / CHI2[0.5][1]) + minimum
+        )
     weights = np.ones(n_windows)
     for _ in range(_NOISE_ROUNDS):
         squared = np.einsum("kc,cd,kd->k", residuals, inverse(noise), residuals)
         if is_weighted:
             weights = (STUDENT + n_components) / (STUDENT + squared)
-        noise = (weights[:, None] * residuals).T @ residuals / n_windows + minimum
+        noise = (
+            weights[:, None] * residuals
+        ).T @ residuals / n_windows + minimum
     if is_weighted:
         weights[squared > CHI2[_TAIL][n_components]] = 0.0
     return weights, noise
@@ -553,7 +585,9 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     else:
         forward, left, unit_turns = drive.motions_of_unit_vehicle()
         displacements = forward + 1j * left
-        turn_ratio = turns @ unit_turns / (unit_turns @ unit_turns + _MIN_VARIANCE)
+        turn_ratio = (
+            turns @ unit_turns / (unit_turns @ unit_turns + _MIN_VARIANCE)
+        )
     up = np.sign(turn_ratio) * axis
     turns = np.sign(turn_ratio) * turns
     # Level axes of the sensor: any direction perpendicular to up is the first axis.
@@ -561,12 +595,16 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     level = np.stack([ahead, np.cross(up, ahead), up])
     x, y, _ = level @ drive.xi[:, :3].T
     columns = np.column_stack([displacements, 1j * turns])
-    factor, rotated_position = np.linalg.lstsq(columns, x + 1j * y, rcond=None)[0]
+    factor, rotated_position = np.linalg.lstsq(columns, x + 1j * y, rcond=None)[
+        0
+    ]
     length_ratio = abs(factor)
     direction = factor / length_ratio  # exp(-i yaw)
     yaw = se3.rotation_exp([0.0, 0.0, -np.angle(direction)])
     position = rotated_position / direction
-    T = se3.from_rotation_translation(yaw @ level, [position.real, position.imag, 0.0])
+    T = se3.from_rotation_translation(
+        yaw @ level, [position.real, position.imag, 0.0]
+    )
     parameters: tuple[float, ...] = ()
     if drive.model is not None:
         parameters = drive.model.parameters_of(length_ratio, abs(turn_ratio))

@@ -33,11 +33,15 @@ _COLUMNS = {
 
 def _unit_of(column: str) -> float:
     """Return the unit of a column by its name; 1 for rad/s, rad and m/s."""
-    units = [unit for name, unit in _UNITS.items() if column.endswith(f"_{name}")]
+    units = [
+        unit for name, unit in _UNITS.items() if column.endswith(f"_{name}")
+    ]
     return units[0] if units else 1.0
 
 
-def _along_and_across(speed: FloatArray, angle: FloatArray) -> tuple[FloatArray, ...]:
+def _along_and_across(
+    speed: FloatArray, angle: FloatArray
+) -> tuple[FloatArray, ...]:
     """Return the rates of a unit vehicle from a speed and a steering angle."""
     return speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle)
 
@@ -57,7 +61,13 @@ _RATES: dict[str, Callable[..., tuple[ArrayLike, ...]]] = {
 }
 
 # Number of columns of wheel data without the stamps.
-_N_COLUMNS = {"wheels": 2, "steering": 2, "tricycle": 2, "wheel_odometry": 2, "omni": 3}
+_N_COLUMNS = {
+    "wheels": 2,
+    "steering": 2,
+    "tricycle": 2,
+    "wheel_odometry": 2,
+    "omni": 3,
+}
 
 # Units at the end of the name of a column, in rad/s, rad or m/s.
 _UNITS = {
@@ -131,7 +141,9 @@ def unit_rates(measures: str, columns: Iterable[Any]) -> tuple[Any, ...]:
     return _RATES[measures](*columns)
 
 
-def unit_path(stamps_ns: IntArray, means: FloatArray, measures: str) -> Trajectory:
+def unit_path(
+    stamps_ns: IntArray, means: FloatArray, measures: str
+) -> Trajectory:
     """Return the path of the unit vehicle from the wheel data (N - 1, C) between N stamps.
 
     Raises
@@ -163,10 +175,21 @@ def table_of_wheels(
     InputError
         If a row cannot be read, or stamps do not increase.
     """
-    first_line = data[:LONGEST_LINE].partition(b"\n")[0].decode(errors="replace")
-    line = (options.columns or first_line).strip("\ufeff#% \r").lower().replace(" ", "")
+    first_line = (
+        data[:LONGEST_LINE].partition(b"\n")[0].decode(errors="replace")
+    )
+    line = (
+        (options.columns or first_line)
+        .strip("\ufeff#% \r")
+        .lower()
+        .replace(" ", "")
+    )
     stamp, _, names = line.partition(",")
-    kinds = [kind for pattern, kind in _COLUMNS.items() if re.fullmatch(pattern, names)]
+    kinds = [
+        kind
+        for pattern, kind in _COLUMNS.items()
+        if re.fullmatch(pattern, names)
+    ]
     if not kinds:
         return None
     rows = []
@@ -181,8 +204,12 @@ def table_of_wheels(
     values = rates.values()[:, :n_values] * [
         _unit_of(name) for name in names.split(",")
     ]
-    wheels = wheel_trajectory(stamps_in_ns(rates, options.stamp_unit), values, kinds[0])
-    table = Table(path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame)
+    wheels = wheel_trajectory(
+        stamps_in_ns(rates, options.stamp_unit), values, kinds[0]
+    )
+    table = Table(
+        path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame
+    )
     table.fill_from_arrays(se3.to_rows(wheels.poses), rates.stamps)
     table.measures = kinds[0]
     return table

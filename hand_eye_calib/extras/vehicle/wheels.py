@@ -172,17 +172,23 @@ def steps_between(
     step, and ``turns`` (N,) those of the steps, rad.
     """
     arcs = (
-        chords * np.exp(-1j * (headings + turns / 2.0)) / np.sinc(turns / (2.0 * np.pi))
+        chords
+        * np.exp(-1j * (headings + turns / 2.0))
+        / np.sinc(turns / (2.0 * np.pi))
     )
     return np.stack([arcs.real, arcs.imag, turns])
 
 
-def trajectory_of(stamps_ns: IntArray, steps: FloatArray, measures: str) -> Trajectory:
+def trajectory_of(
+    stamps_ns: IntArray, steps: FloatArray, measures: str
+) -> Trajectory:
     """Return the path of the unit vehicle from its steps (3, N - 1) between stamps (N,)."""
     positions, headings = path_of(steps)
     poses = se3.from_rotation_translation(
         se3.rotation_exp(headings[:, None] * [0.0, 0.0, 1.0]),
-        np.stack([positions.real, positions.imag, np.zeros(len(positions))], axis=-1),
+        np.stack(
+            [positions.real, positions.imag, np.zeros(len(positions))], axis=-1
+        ),
     )
     return Trajectory(stamps_ns, poses, "base_link", "", measures)
 
@@ -196,7 +202,9 @@ def steps_of(trajectory: Trajectory) -> FloatArray:
     return steps_between(np.diff(positions), headings[:-1], np.diff(headings))
 
 
-def motions(stamps_s: FloatArray, steps: FloatArray, ends_s: FloatArray) -> FloatArray:
+def motions(
+    stamps_s: FloatArray, steps: FloatArray, ends_s: FloatArray
+) -> FloatArray:
     """Return the motion (3, K) in each window: forward, left and turn along one arc.
 
     Parameters
@@ -210,4 +218,6 @@ def motions(stamps_s: FloatArray, steps: FloatArray, ends_s: FloatArray) -> Floa
     positions, headings = path_of(steps)
     start, end = np.interp(ends_s, stamps_s, positions)
     start_heading, end_heading = np.interp(ends_s, stamps_s, headings)
-    return steps_between(end - start, start_heading, end_heading - start_heading)
+    return steps_between(
+        end - start, start_heading, end_heading - start_heading
+    )

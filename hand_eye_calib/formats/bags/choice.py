@@ -92,7 +92,9 @@ class _Candidate(NamedTuple):
         if self.frame and self.frame == other.frame:
             return True
         words = words_of(self.name) - _KINDS_OF_MESSAGES
-        return bool(words) and words == words_of(other.name) - _KINDS_OF_MESSAGES
+        return (
+            bool(words) and words == words_of(other.name) - _KINDS_OF_MESSAGES
+        )
 
 
 def _of_types(
@@ -100,7 +102,9 @@ def _of_types(
 ) -> list[TopicInfo]:
     """Return the topics with messages of some types, and with at least ``min_count`` messages."""
     return [
-        topic for topic in topics if topic.type in types and topic.count >= min_count
+        topic
+        for topic in topics
+        if topic.type in types and topic.count >= min_count
     ]
 
 
@@ -134,10 +138,13 @@ def choose(
     paths = _of_types(topics, {messages.PATH_TYPE})
     others = _of_types(topics, messages.FIELD_POSE_TYPES, _MIN_POSES)
     candidates = [
-        _Candidate(topic, frame_of(topic.name)) for topic in moving + paths + others
+        _Candidate(topic, frame_of(topic.name))
+        for topic in moving + paths + others
     ]
     sensors = _topic_of_each_sensor(candidates)
-    of_known_kinds = [sensor for sensor in sensors if sensor.rank < len(_SENSORS)]
+    of_known_kinds = [
+        sensor for sensor in sensors if sensor.rank < len(_SENSORS)
+    ]
     groups: list[Sequence[TopicInfo | _Candidate]] = [
         poses,
         moving,
@@ -159,7 +166,9 @@ def choose(
         partners = [topic for topic in topics if frame_of(topic.name) != frame]
     if n_missing == 1:
         # Wheels are always the parent, which the user may have named already.
-        partners = [topic for topic in partners if topic.type != messages.JOINTS_TYPE]
+        partners = [
+            topic for topic in partners if topic.type != messages.JOINTS_TYPE
+        ]
     raise _unclear(
         topics, [sensor.topic for sensor in sensors], missing, edges, partners
     )
@@ -169,10 +178,13 @@ def _topic_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:
     """Return the likeliest topic of each sensor, the likeliest sensor first."""
     sensors: list[_Candidate] = []
     ranked = sorted(
-        candidates, key=lambda candidate: (candidate.rank, -candidate.topic.count)
+        candidates,
+        key=lambda candidate: (candidate.rank, -candidate.topic.count),
     )
     for candidate in ranked:
-        is_same_sensor = any(candidate.has_sensor_of(sensor) for sensor in sensors)
+        is_same_sensor = any(
+            candidate.has_sensor_of(sensor) for sensor in sensors
+        )
         if candidate.is_of_sensor and not is_same_sensor:
             sensors.append(candidate)
     return sensors
@@ -193,14 +205,18 @@ def _unclear(
     """
     if not any(topic.count for topic in topics) and len(missing) > 1:
         return UnclearStreamsError("the bag has no messages: record again", {})
-    problem, sources = _problem_and_sources(partners, sensors, edges, len(missing))
+    problem, sources = _problem_and_sources(
+        partners, sensors, edges, len(missing)
+    )
     if len(sources) >= len(missing):
         return UnclearStreamsError(problem, _options(missing, sources))
     advice = "record the odometry of the other sensor"
     if not sensors:
         advice = _advice({topic.type for topic in topics}, len(missing))
     listed = (
-        f"The bag has {_listed(topics)}" if topics else "The bag has no other topics"
+        f"The bag has {_listed(topics)}"
+        if topics
+        else "The bag has no other topics"
     )
     return UnclearStreamsError(f"{problem}: {advice}. {listed}", {})
 
@@ -224,14 +240,14 @@ def _problem_and_sources(
     if sensors:
         return _partners_of(sensors[0], topics, pairs)
     # A topic that the user has named is not among the topics.
-    no_poses = "no topic has poses" if n_missing > 1 else "no other topic has poses"
+    no_poses = (
+        "no topic has poses" if n_missing > 1 else "no other topic has poses"
+    )
     if len(pairs) >= n_missing:
         listed = shortened(listing(pairs), _LONGEST_LIST)
         return f"{no_poses}, but transforms have: {listed}", pairs
     if len(clouds) >= n_missing:
-        problem = (
-            f"{no_poses}; the odometry of lidars can be computed from {_listed(clouds)}"
-        )
+        problem = f"{no_poses}; the odometry of lidars can be computed from {_listed(clouds)}"
         return problem, [topic.name for topic in clouds]
     frames = {edge.split(":")[-1] for edge in edges}
     worlds = {edge.split(":")[0] for edge in edges}
@@ -285,9 +301,7 @@ def _advice(types: set[str], n_missing: int) -> str:
     if not types.isdisjoint(messages.IMAGE_TYPES):
         return "run visual odometry or SLAM on the images, and record its poses"
     if _FIX in types and _IMU in types:
-        return (
-            "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
-        )
+        return "GNSS and IMU need the poses of another sensor: record its odometry or SLAM"
     sensors = "both sensors" if n_missing > 1 else "the other sensor"
     return f"run the odometry or SLAM of {sensors}, and record it"
 
@@ -310,7 +324,8 @@ def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     if len(chosen) > 1:
         chosen = roles.parent_and_child(chosen, {}, {})
     return {
-        f"{stream}_topic": name for stream, name in zip(missing, chosen, strict=True)
+        f"{stream}_topic": name
+        for stream, name in zip(missing, chosen, strict=True)
     }
 
 

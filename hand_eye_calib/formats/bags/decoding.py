@@ -10,7 +10,11 @@ from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any
 
-from hand_eye_calib.core.base.errors import HandEyeCalibError, InputError, required
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError,
+    InputError,
+    required,
+)
 from hand_eye_calib.formats.bags.storage import MessageKind
 
 
@@ -24,7 +28,9 @@ def decoder_of(kind: MessageKind) -> Callable[[bytes], Any]:
         If the encoding or the definition of the messages is unknown.
     """
     if kind.encoding == "json":
-        return partial(json.loads, object_hook=lambda fields: SimpleNamespace(**fields))
+        return partial(
+            json.loads, object_hook=lambda fields: SimpleNamespace(**fields)
+        )
     if kind.encoding not in ("cdr", "ros1", "protobuf"):
         raise InputError(
             f"messages of type {kind.type} have the encoding "
@@ -48,7 +54,9 @@ def _protobuf_decoder(kind: MessageKind) -> Any:
     """Return the function that decodes messages in protobuf."""
     language, content = kind.definition
     mcap_protobuf = required("mcap_protobuf.decoder", kind.type, "foxglove")
-    schema = SimpleNamespace(id=0, name=kind.type, encoding=language, data=content)
+    schema = SimpleNamespace(
+        id=0, name=kind.type, encoding=language, data=content
+    )
     return mcap_protobuf.DecoderFactory().decoder_for(kind.encoding, schema)
 
 
@@ -61,7 +69,9 @@ def _rosbags_decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         get_typestore,
     )
 
-    typestore = get_typestore(Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY)
+    typestore = get_typestore(
+        Stores.ROS1_NOETIC if kind.is_ros1 else Stores.ROS2_JAZZY
+    )
     language, content = kind.definition
     if content and kind.type not in typestore.types:
         text = content.decode()
@@ -72,5 +82,9 @@ def _rosbags_decoder(kind: MessageKind) -> Callable[[bytes], Any]:
         new_names = defined.keys() - typestore.types.keys()
         typestore.register({name: defined[name] for name in new_names})
     typestore.types[kind.type]  # raises KeyError if the type is not defined
-    decode = typestore.deserialize_ros1 if kind.is_ros1 else typestore.deserialize_cdr
+    decode = (
+        typestore.deserialize_ros1
+        if kind.is_ros1
+        else typestore.deserialize_cdr
+    )
     return lambda data: decode(data, kind.type)

@@ -25,7 +25,9 @@ from hand_eye_calib.formats.results import FILE_NAME
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # What a path of a bag may be, for messages.
-_EXPECTED = "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
+_EXPECTED = (
+    "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
+)
 # Endings of files that SQLite keeps next to a .db3 while writing. If the recorder was killed, these
 # files contain its newest messages.
 _UNFINISHED = ("-wal", "-journal")
@@ -144,7 +146,9 @@ def _files_of(path: Path) -> list[Path]:
         raise InputError(
             f"no bag at {path}{files.similar(path) or f'; expected {_EXPECTED}'}"
         )
-    paths = {file for file in path.iterdir() if _suffix(file) and file.is_file()}
+    paths = {
+        file for file in path.iterdir() if _suffix(file) and file.is_file()
+    }
     if not paths:
         raise InputError(_no_files(path))
     return sorted(
@@ -170,13 +174,9 @@ def _no_files(folder: Path) -> str:
         file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]
     ):
         if any(map(_suffix, subfolder.iterdir())):
-            advice = (
-                f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
-            )
+            advice = f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
             break
-    return (
-        f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
-    )
+    return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
 
 
 class MissingFiles(NamedTuple):
@@ -204,7 +204,8 @@ def missing_files(folder: Path) -> MissingFiles:
     with suppress(InputError, AttributeError, TypeError, KeyError):
         metadata = read_yaml(folder / _METADATA)["rosbag2_bagfile_information"]
         counts = {
-            file["path"]: file["message_count"] for file in metadata.get("files") or ()
+            file["path"]: file["message_count"]
+            for file in metadata.get("files") or ()
         }
         for path in map(str, metadata["relative_file_paths"]):
             name = printable_name(PurePath(path).name)
@@ -237,9 +238,13 @@ def losses_of(path: Path, n_present: int) -> list[str]:
     n_missing = sum(counts)
     # If the number is not known for all files, use the number of messages of the whole bag.
     if len(counts) < len(missing):
-        n_missing = max(n_in_bag - n_present, 0) if isinstance(n_in_bag, int) else 0
+        n_missing = (
+            max(n_in_bag - n_present, 0) if isinstance(n_in_bag, int) else 0
+        )
     verb = "is" if len(missing) == 1 else "are"
-    line = f"{path}: {_METADATA} lists {_listing(missing)}, which {verb} missing"
+    line = (
+        f"{path}: {_METADATA} lists {_listing(missing)}, which {verb} missing"
+    )
     if n_missing:
         n_all = n_missing + n_present
         line += f": {n_missing:,} of {n_all:,} messages ({share(n_missing / n_all)}) are not read"

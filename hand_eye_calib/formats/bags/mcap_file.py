@@ -59,11 +59,14 @@ class McapFile(Storage):
         )
         for key, channel in summary.channels.items():
             self._add_kind(channel, summary.schemas)
-            self.counts[self._kinds[key]] += statistics.channel_message_counts.get(
-                key, 0
+            self.counts[self._kinds[key]] += (
+                statistics.channel_message_counts.get(key, 0)
             )
         if statistics.message_count:
-            self.span_ns = statistics.message_start_time, statistics.message_end_time
+            self.span_ns = (
+                statistics.message_start_time,
+                statistics.message_end_time,
+            )
 
     def _checked_summary(self) -> Any:
         """Return the summary of the file; raise an error of any type if the summary is incomplete.
@@ -110,14 +113,17 @@ class McapFile(Storage):
             elif isinstance(record, records.Channel):
                 self._add_kind(record, schemas)
             elif (
-                isinstance(record, records.Message) and record.channel_id in self._kinds
+                isinstance(record, records.Message)
+                and record.channel_id in self._kinds
             ):
                 self.counts[self._kinds[record.channel_id]] += 1
                 times_ns.append(record.log_time)
         if times_ns:
             self.span_ns = min(times_ns), max(times_ns)
             seconds = (self.span_ns[1] - self.span_ns[0]) * 1e-9
-            recovered = f"{len(times_ns)} messages over {seconds:.1f} s were recovered"
+            recovered = (
+                f"{len(times_ns)} messages over {seconds:.1f} s were recovered"
+            )
             self.losses = [
                 f"it is truncated or damaged ({loss}); the rest is lost; {recovered}"
                 for loss in self.losses
@@ -133,12 +139,16 @@ class McapFile(Storage):
         if not self._chunks:
             # Opening the file has added the damage to `losses` already, so pass another list.
             for record in self._records([]):
-                if isinstance(record, records.Message) and record.channel_id in kinds:
+                if (
+                    isinstance(record, records.Message)
+                    and record.channel_id in kinds
+                ):
                     yield kinds[record.channel_id], record.log_time, record.data
         start_ns, stop_ns = span_ns
         for index in self._chunks:
             is_outside = (
-                index.message_end_time < start_ns or index.message_start_time >= stop_ns
+                index.message_end_time < start_ns
+                or index.message_start_time >= stop_ns
             )
             if is_outside:
                 continue
@@ -154,7 +164,9 @@ class McapFile(Storage):
         """Return the unpacked records of the chunk that begins at byte ``start`` of the file."""
         self._stream.seek(start + _RECORD.size)
         chunk = records.Chunk.read(ReadDataStream(self._stream))
-        stream, size = stream_reader.get_chunk_data_stream(chunk, validate_crc=True)
+        stream, size = stream_reader.get_chunk_data_stream(
+            chunk, validate_crc=True
+        )
         return bytes(stream.read(size))
 
     def _records(self, losses: list[str]) -> Iterator[Any]:
@@ -164,7 +176,9 @@ class McapFile(Storage):
         """
         position = self._stream.seek(0)
         try:
-            for record in StreamReader(self._stream, validate_crcs=True).records:
+            for record in StreamReader(
+                self._stream, validate_crcs=True
+            ).records:
                 yield record
                 position = self._stream.tell()
         except MemoryError:
@@ -187,7 +201,9 @@ class McapFile(Storage):
                 return
             chunk = records.Chunk.read(ReadDataStream(file))
             if chunk.compression == "zstd":
-                zstd = stream_reader.zstandard.ZstdDecompressor().decompressobj()
+                zstd = (
+                    stream_reader.zstandard.ZstdDecompressor().decompressobj()
+                )
                 chunk.data = zstd.decompress(chunk.data)
             elif chunk.compression == "lz4":
                 # Before mcap 1.6, `stream_reader.lz4` is the package instead of its module frame.
@@ -215,7 +231,11 @@ def _messages_of_chunk(
         if opcode == message_opcode:
             channel, bag_ns = _MESSAGE.unpack_from(content, start)
             if channel in kinds:
-                yield kinds[channel], bag_ns, content[start + _MESSAGE.size : end]
+                yield (
+                    kinds[channel],
+                    bag_ns,
+                    content[start + _MESSAGE.size : end],
+                )
 
 
 class _WholeReads(BufferedReader):

@@ -66,7 +66,9 @@ class Cursor:
     def read(self, format_: str) -> tuple[Any, ...]:
         """Read numbers; ``format_`` is a format of ``struct`` with numbers of the same size."""
         if not self._is_ros1:
-            self.position += (START - self.position) % struct.calcsize(format_[-1])
+            self.position += (START - self.position) % struct.calcsize(
+                format_[-1]
+            )
         values = struct.unpack_from(f"<{format_}", self._data, self.position)
         self.position += struct.calcsize(f"={format_}")
         return values
@@ -183,7 +185,9 @@ TF_TYPES = (
 )
 
 
-def _pose_fields(position: str, orientation: str, stamp: str = "header.stamp") -> str:
+def _pose_fields(
+    position: str, orientation: str, stamp: str = "header.stamp"
+) -> str:
     """Return the fields of a pose, in the notation of :mod:`.sources`.
 
     The parameters are the paths of its position, orientation and stamp in a message.
@@ -219,7 +223,9 @@ _FIELDS = {
     "lon_deg=pose.position.longitude,height=pose.position.altitude,"
     + _rotation_fields("pose.orientation"),
     "geometry_msgs/msg/TwistStamped": _twist_fields("twist"),
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_fields("twist.twist"),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_fields(
+        "twist.twist"
+    ),
     "px4_msgs/msg/VehicleOdometry": "t_us=timestamp_sample,x=position.0,y=position.1,z=position.2,"
     "qw=q.0,qx=q.1,qy=q.2,qz=q.3",
     "geometry_msgs/msg/PoseArray": _pose_fields(
@@ -237,15 +243,21 @@ _FIELDS = {
     "foxglove.PosesInFrame": _pose_fields(
         "poses.0.position", "poses.0.orientation", "timestamp"
     ),
-    "foxglove.FrameTransform": _pose_fields("translation", "rotation", "timestamp"),
+    "foxglove.FrameTransform": _pose_fields(
+        "translation", "rotation", "timestamp"
+    ),
     "gps_msgs/msg/GPSFix": "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
     "foxglove.LocationFix": "t=timestamp,lat_deg=latitude,lon_deg=longitude,height=altitude",
 }
 # All types, the most frequent first.
 _ROWS = [
-    MessageType("nav_msgs/msg/Odometry", _OF_POSES, unpack_pose, has_child_frame=True),
+    MessageType(
+        "nav_msgs/msg/Odometry", _OF_POSES, unpack_pose, has_child_frame=True
+    ),
     MessageType("geometry_msgs/msg/PoseStamped", _OF_POSES, unpack_pose),
-    MessageType("geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, unpack_pose),
+    MessageType(
+        "geometry_msgs/msg/PoseWithCovarianceStamped", _OF_POSES, unpack_pose
+    ),
     MessageType(
         "geometry_msgs/msg/TransformStamped",
         _OF_POSES,
@@ -267,10 +279,14 @@ MESSAGE_TYPES = {row.name: row for row in _ROWS}
 #: Types with a complete pose in each message, which is unpacked from the bytes.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is unpack_pose)
 #: Types whose header contains the sensor's frame, not a world frame.
-SENSOR_TYPES = tuple(row.name for row in _ROWS if row.unpack in (_imu, unpack_fix))
+SENSOR_TYPES = tuple(
+    row.name for row in _ROWS if row.unpack in (_imu, unpack_fix)
+)
 #: Types with a complete pose in each message, whose fields a library decodes.
 FIELD_POSE_TYPES = tuple(
-    name for name, fields in _FIELDS.items() if "qw=" in fields or "roll" in fields
+    name
+    for name, fields in _FIELDS.items()
+    if "qw=" in fields or "roll" in fields
 )
 
 
@@ -317,7 +333,9 @@ def ns_of(stamp: Any) -> int | None:
         ("seconds", "nanos"),
     ):
         if hasattr(stamp, nanoseconds):
-            return int(getattr(stamp, seconds) * NS_PER_S + getattr(stamp, nanoseconds))
+            return int(
+                getattr(stamp, seconds) * NS_PER_S + getattr(stamp, nanoseconds)
+            )
     return None
 
 
@@ -362,7 +380,9 @@ class Run(NamedTuple):
         for data in self.messages:
             try:
                 message = decode(data)
-            except Exception as error:  # the libraries raise errors of many kinds
+            except (
+                Exception
+            ) as error:  # the libraries raise errors of many kinds
                 raise self.unreadable(error) from error
             yield message
 
@@ -374,7 +394,9 @@ class Run(NamedTuple):
         InputError
             If a message cannot be decoded.
         """
-        for message, bag_ns in zip(self.decoded(), self.bag_ns.tolist(), strict=True):
+        for message, bag_ns in zip(
+            self.decoded(), self.bag_ns.tolist(), strict=True
+        ):
             try:
                 for transform in getattr(message, "transforms", [message]):
                     yield bag_ns, transform_of(transform)

@@ -92,4 +92,7 @@ def _is_recording(path: Path) -> bool:
     """Whether a path is a bag, and not a file inside a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
-    return path.suffix in _SUFFIXES and not (path.parent / "metadata.yaml").exists()
+    return (
+        path.suffix in _SUFFIXES
+        and not (path.parent / "metadata.yaml").exists()
+    )

@@ -51,12 +51,21 @@ def rows_of_points(message: Any) -> Any:
     row_step = max(message.row_step, width) if message.height > 1 else width
     byte_order = ">" if message.is_bigendian else "<"
     try:
-        formats = [byte_order + _DATATYPES[field.datatype] for field in fields.values()]
+        formats = [
+            byte_order + _DATATYPES[field.datatype] for field in fields.values()
+        ]
         offsets = [field.offset for field in fields.values()]
         dtype = np.dtype(
-            {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
+            {
+                "names": names,
+                "formats": formats,
+                "offsets": offsets,
+                "itemsize": size,
+            }
         )
-        data = np.asarray(message.data, dtype=np.uint8)[: message.height * row_step]
+        data = np.asarray(message.data, dtype=np.uint8)[
+            : message.height * row_step
+        ]
         rows = data.reshape(message.height, row_step)[:, :width]
         return np.ascontiguousarray(rows).reshape(-1).view(dtype)
     except (ValueError, IndexError, TypeError) as error:
@@ -72,13 +81,17 @@ def times_of_points(rows: Any, header_ns: int) -> tuple[FloatArray, int]:
     points count as measured at this stamp if the message has no times of points.
     """
     times = np.zeros(len(rows))
-    time_field = next((name for name in _TIME_FIELDS if name in rows.dtype.names), "")
+    time_field = next(
+        (name for name in _TIME_FIELDS if name in rows.dtype.names), ""
+    )
     if time_field:
         times = rows[time_field].astype(float)
     first = times.min() if len(times) else 0.0
     last = times.max() if len(times) else 0.0
     duration = last - first
-    units_ns = [ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= _LONGEST_NS]
+    units_ns = [
+        ns for ns in STAMP_UNITS.values() if 0 < duration * ns <= _LONGEST_NS
+    ]
     unit_ns = max(units_ns, default=0)
     middle = (first + last) / 2
     stamp_ns = round(float(middle) * unit_ns)
@@ -88,12 +101,16 @@ def times_of_points(rows: Any, header_ns: int) -> tuple[FloatArray, int]:
     return (times - middle) * unit_ns * 1e-9, stamp_ns
 
 
-def topics_and_frames(bag: "PoseBag", message_type: str) -> Iterator[tuple[str, str]]:
+def topics_and_frames(
+    bag: "PoseBag", message_type: str
+) -> Iterator[tuple[str, str]]:
     """Yield topics of a type and the frames of their first messages.
 
     The topic with most messages is first. Topics without a readable message are skipped.
     """
-    topics = [topic for topic in bag.topics.values() if topic.type == message_type]
+    topics = [
+        topic for topic in bag.topics.values() if topic.type == message_type
+    ]
     for topic in sorted(topics, key=lambda topic: -topic.count):
         run = next(bag.runs([topic.name]), None)
         if run is None:

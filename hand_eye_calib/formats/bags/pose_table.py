@@ -51,7 +51,9 @@ class PoseTable(Columns):
         stamps_ns = np.array(stamps_ns, dtype=np.int64)
 
         def column(value: Any) -> NDArray[np.object_]:
-            return np.broadcast_to(np.array(value, dtype=object), stamps_ns.shape)
+            return np.broadcast_to(
+                np.array(value, dtype=object), stamps_ns.shape
+            )
 
         return cls(
             streams=column(""),
@@ -65,7 +67,9 @@ class PoseTable(Columns):
     def recorded(self, stream: str, bag_ns: Any) -> Self:
         """Return the table with the name of its stream and the bag times (N,) of its poses."""
         streams = np.full(len(self), stream, dtype=object)
-        return replace(self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64))
+        return replace(
+            self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64)
+        )
 
     @classmethod
     def joined(cls, tables: Iterable[Self]) -> Self:
@@ -73,7 +77,11 @@ class PoseTable(Columns):
         table = cls.concatenate(*tables)
         # Most bags are in order: do not copy their columns.
         is_sorted = (np.diff(table.bag_ns) >= 0).all()
-        return table if is_sorted else table[np.argsort(table.bag_ns, kind="stable")]
+        return (
+            table
+            if is_sorted
+            else table[np.argsort(table.bag_ns, kind="stable")]
+        )
 
     def trajectory(self) -> Trajectory:
         """Return the trajectory of a table with one stream, sorted by stamps.

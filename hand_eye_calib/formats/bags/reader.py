@@ -1,7 +1,14 @@
 """Read the poses of two streams, parent and child, from bags."""
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import (
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import cached_property
@@ -62,7 +69,9 @@ class PoseBag:
         with ExitStack() as opened:
             self._storages = open_bags(self.paths, opened)
             self._opened = opened.pop_all()
-        self.files = [file for storage in self._storages for file in storage.paths]
+        self.files = [
+            file for storage in self._storages for file in storage.paths
+        ]
         self.topics = self._all_topics()
         for path in self.paths:
             n_present = 0
@@ -81,7 +90,9 @@ class PoseBag:
         topics: dict[str, TopicInfo] = {}
         for storage in self._storages:
             for kind, count in storage.counts.items():
-                previous = topics.get(kind.topic, TopicInfo(kind.topic, kind.type, 0))
+                previous = topics.get(
+                    kind.topic, TopicInfo(kind.topic, kind.type, 0)
+                )
                 type_ = kind.type if kind.type == previous.type else ""
                 topics[kind.topic] = TopicInfo(
                     kind.topic, type_, previous.count + count
@@ -105,7 +116,9 @@ class PoseBag:
         """
         warnings = [*self._notes]
         for storage in self._storages:
-            warnings += [f"{storage.paths[0]}: {loss}" for loss in storage.losses]
+            warnings += [
+                f"{storage.paths[0]}: {loss}" for loss in storage.losses
+            ]
         return warnings
 
     @property
@@ -170,7 +183,9 @@ class PoseBag:
         if wanted == "auto":
             return usual
         if usual not in ("poses", wanted):
-            raise ConfigError(f"{source} measures {usual}; asked for are {wanted}")
+            raise ConfigError(
+                f"{source} measures {usual}; asked for are {wanted}"
+            )
         return wanted
 
     def check(self, source: Source, taken: Sequence[Source] = ()) -> None:
@@ -191,11 +206,14 @@ class PoseBag:
             if name not in self.topics:
                 hint = (
                     did_you_mean(
-                        name, [topic for topic in self.topics if topic not in taken]
+                        name,
+                        [topic for topic in self.topics if topic not in taken],
                     )
                     or "."
                 )
-                raise InputError(f"no topic {name} in {self}{hint} {self._listing()}")
+                raise InputError(
+                    f"no topic {name} in {self}{hint} {self._listing()}"
+                )
         if len(topics) > 1:
             self.measured(topics[0], "positions")
             self.measured(topics[1], "rotations")
@@ -281,13 +299,17 @@ class PoseBag:
         parent, child = roles.parent_and_child(topics, frames, sensors)
         return parent, child
 
-    def _choice(self, missing: Sequence[str], used: Collection[Source]) -> list[str]:
+    def _choice(
+        self, missing: Sequence[str], used: Collection[Source]
+    ) -> list[str]:
         """Return the topics for the missing streams, "parent" or "child" or both.
 
         Raises UnclearStreamsError if no choice is obvious. ``used`` are sources that the user
         names.
         """
-        free = [topic for topic in self.topics.values() if topic.name not in used]
+        free = [
+            topic for topic in self.topics.values() if topic.name not in used
+        ]
         moving_edges = set()
         for topic in self._tf_topics():
             if not topic.endswith("tf_static"):
@@ -303,7 +325,9 @@ class PoseBag:
         if run is None:
             return ""
         try:
-            table = unpacking.unpack_poses(run.messages[:1], type_, run.kind.is_ros1)
+            table = unpacking.unpack_poses(
+                run.messages[:1], type_, run.kind.is_ros1
+            )
         except messages.MALFORMED as error:
             raise run.unreadable(error) from error
         if type_ in messages.SENSOR_TYPES:
@@ -349,7 +373,9 @@ class PoseBag:
         """
         readings = [self._reading("parent", parent, measures or {}, max_gap_s)]
         if child:
-            readings.append(self._reading("child", child, measures or {}, max_gap_s))
+            readings.append(
+                self._reading("child", child, measures or {}, max_gap_s)
+            )
         return self._poses_of(readings, stamps or {})
 
     def _poses_of(
@@ -374,17 +400,25 @@ class PoseBag:
         return PoseTable.joined(tables)
 
     def _reading(
-        self, stream: str, source: Source, measures: Mapping[str, str], max_gap_s: float
+        self,
+        stream: str,
+        source: Source,
+        measures: Mapping[str, str],
+        max_gap_s: float,
     ) -> Reading:
         """Return the reader for a source. ``stream`` is "parent" or "child"."""
         if isinstance(source, TfSource):
             # Raise an InputError if the frames are not connected.
             self.static_frames.route(*source)
             tf_stream = TfStream(source, max_gap_s, self.static_frames)
-            return sources.TransformReading(stream, tf_stream, self._tf_topics())
+            return sources.TransformReading(
+                stream, tf_stream, self._tf_topics()
+            )
         topic, _, fields = source.partition("?")
         if ":" in fields and "=" not in fields:
-            return BAG_READINGS["images of a target"](self, stream, topic, fields)
+            return BAG_READINGS["images of a target"](
+                self, stream, topic, fields
+            )
         type_ = self.type_of(topic)
         if type_ == messages.JOINTS_TYPE and "=" not in fields:
             return BAG_READINGS[type_](
@@ -400,7 +434,9 @@ class PoseBag:
             return sources.TopicReading(stream, topic, type_, wanted)
         return self._reading_of_several_poses(stream, topic, type_)
 
-    def _reading_of_several_poses(self, stream: str, topic: str, type_: str) -> Reading:
+    def _reading_of_several_poses(
+        self, stream: str, topic: str, type_: str
+    ) -> Reading:
         """Return the reader for a topic whose messages are not a pose each.
 
         These are paths, clouds, and fixes with the rotations of another topic.
@@ -411,7 +447,9 @@ class PoseBag:
             return BAG_READINGS[type_](self, stream, topic, "")
         fixes, rotations = self._parts_of(topic)
         return sources.JoinedReading(
-            sources.TopicReading(stream, fixes, self.type_of(fixes), "positions"),
+            sources.TopicReading(
+                stream, fixes, self.type_of(fixes), "positions"
+            ),
             sources.TopicReading(
                 stream, rotations, self.type_of(rotations), "rotations"
             ),
@@ -482,7 +520,9 @@ class PoseBag:
                 try:
                     pose = checked_pose(*values) if is_static else None
                 except InputError as error:
-                    notes[frame] = f"transform {parent}:{frame} was left out: {error}"
+                    notes[frame] = (
+                        f"transform {parent}:{frame} was left out: {error}"
+                    )
                 else:
                     tree.add(parent, frame or "", pose, is_static)
         self._notes += notes.values()
@@ -490,7 +530,9 @@ class PoseBag:
 
     # ---- messages
 
-    def runs(self, topics: Collection[str], span_ns: Span = ALWAYS) -> Iterator[Run]:
+    def runs(
+        self, topics: Collection[str], span_ns: Span = ALWAYS
+    ) -> Iterator[Run]:
         """Iterate over the messages of some topics in the order of bag time, in runs of one kind.
 
         A run has the messages of one kind in a block of a file. Files that were recorded at the
@@ -500,7 +542,9 @@ class PoseBag:
         start_ns, stop_ns = span_ns
         for storage in self._storages:
             for block in storage.blocks(topics, span_ns):
-                rows_of = defaultdict[MessageKind, list[tuple[int, bytes]]](list)
+                rows_of = defaultdict[MessageKind, list[tuple[int, bytes]]](
+                    list
+                )
                 for kind, bag_ns, data in block:
                     if start_ns <= bag_ns < stop_ns:
                         rows_of[kind].append((bag_ns, data))
@@ -515,5 +559,7 @@ def _bag_times(bag_ns: Sequence[int]) -> IntArray:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:
         limits = np.iinfo(np.int64)
-        inside = [min(max(time_ns, limits.min), limits.max) for time_ns in bag_ns]
+        inside = [
+            min(max(time_ns, limits.min), limits.max) for time_ns in bag_ns
+        ]
         return np.array(inside, dtype=np.int64)

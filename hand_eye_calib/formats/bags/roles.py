@@ -77,7 +77,9 @@ def _match(frame: str, topic: str, sensor: str) -> float:
         score += _SAME_NAME
     elif not sensor:
         score += _NO_NAME
-    shared = (words_of(frame) - _COMMON_WORDS) & (words_of(topic) | words_of(sensor))
+    shared = (words_of(frame) - _COMMON_WORDS) & (
+        words_of(topic) | words_of(sensor)
+    )
     score += _SAME_WORD * len(shared)
     role = role_of(frame)
     if role and role in (role_of(topic), role_of(sensor)):

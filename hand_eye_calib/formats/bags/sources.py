@@ -163,7 +163,9 @@ class TopicReading(Reading):
 
     def take(self, run: messages.Run) -> None:
         try:
-            table, is_usable = self._reader.columns(run.messages, run.kind.is_ros1)
+            table, is_usable = self._reader.columns(
+                run.messages, run.kind.is_ros1
+            )
         except InputError:
             raise
         except messages.MALFORMED as error:
@@ -252,10 +254,14 @@ class JoinedReading(Reading):
             )
         orientations = rotations.trajectory()
         first_ns, last_ns = orientations.stamps_ns[[0, -1]]
-        fixes = fixes[(fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)]
+        fixes = fixes[
+            (fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)
+        ]
         quats_xyzw = se3.to_quat_xyzw(orientations.at(fixes.stamps_ns))
         poses = np.c_[fixes.poses[:, :3], quats_xyzw]
-        table = PoseTable.of(fixes.stamps_ns, poses, "", orientations.sensor_frame)
+        table = PoseTable.of(
+            fixes.stamps_ns, poses, "", orientations.sensor_frame
+        )
         return table.recorded(self.stream, fixes.bag_ns)
 
 
@@ -296,7 +302,9 @@ class PathReading(Reading):
         poses = np.reshape(rows, (-1, 7))
         is_null = are_null(poses)
         self._note_null(int(is_null.sum()), len(poses))
-        table = PoseTable.of(stamps_ns, poses, frame).recorded(self.stream, stamps_ns)
+        table = PoseTable.of(stamps_ns, poses, frame).recorded(
+            self.stream, stamps_ns
+        )
         return self._stamped(table[~is_null])
 
 
@@ -351,13 +359,21 @@ class FieldReading(Reading):
         value = message
         try:
             for name in path:
-                value = value[int(name)] if name.isdecimal() else getattr(value, name)
+                value = (
+                    value[int(name)]
+                    if name.isdecimal()
+                    else getattr(value, name)
+                )
         except (AttributeError, IndexError, TypeError):
             raise InputError(
                 f"{self.name}: a message has no {'.'.join(path)}; name other fields"
             ) from None
         stamp_ns = messages.ns_of(value)
-        return str(value) if stamp_ns is None else f"{Decimal(stamp_ns).scaleb(-9):f}"
+        return (
+            str(value)
+            if stamp_ns is None
+            else f"{Decimal(stamp_ns).scaleb(-9):f}"
+        )
 
     def table(self) -> PoseTable:
         table = self._table
@@ -395,9 +411,12 @@ class TransformReading(Reading):
     The poses have the stamps of the moving transform in the chain that has the lowest rate.
     """
 
-    def __init__(self, stream: str, source: TfStream, topics: Collection[str]) -> None:
+    def __init__(
+        self, stream: str, source: TfStream, topics: Collection[str]
+    ) -> None:
         super().__init__(
-            stream, *(topic for topic in topics if not topic.endswith("tf_static"))
+            stream,
+            *(topic for topic in topics if not topic.endswith("tf_static")),
         )
         self._source = source
         # For each pose: bag time, stamp, and x y z qx qy qz qw of each moving transform by frame.
@@ -427,9 +446,12 @@ class TransformReading(Reading):
             raise InputError(f"{frames}: {self._source.describe_missing()}")
         bag_ns, stamps_ns, edges = zip(*self._poses, strict=True)
         moving = {
-            frame: np.array([rows[frame] for rows in edges]) for frame in edges[0]
+            frame: np.array([rows[frame] for rows in edges])
+            for frame in edges[0]
         }
         poses = se3.to_rows(self._source.composed(moving))
         self._note_null(self._n_null, self._n_null + len(poses))
-        table = PoseTable.of(stamps_ns, poses, *frames).recorded(self.stream, bag_ns)
+        table = PoseTable.of(stamps_ns, poses, *frames).recorded(
+            self.stream, bag_ns
+        )
         return self._stamped(table)

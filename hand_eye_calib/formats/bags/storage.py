@@ -79,7 +79,10 @@ def kind_of(
     if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
     return MessageKind(
-        printable_name(topic), printable_name(name), encoding, (language, content)
+        printable_name(topic),
+        printable_name(name),
+        encoding,
+        (language, content),
     )
 
 
@@ -119,7 +122,9 @@ class Storage(ABC):
         If nothing in the file can be read.
     """
 
-    def __init__(self, paths: list[Path], file: Path, opened: ExitStack) -> None:
+    def __init__(
+        self, paths: list[Path], file: Path, opened: ExitStack
+    ) -> None:
         self.paths = paths
         self.counts = Counter[MessageKind]()
         self.span_ns: tuple[int, ...] = ()
@@ -153,7 +158,11 @@ class Storage(ABC):
         If chunks of an mcap file overlap in time, their messages are in order only within each
         chunk. Messages outside ``span_ns`` may be missing.
         """
-        kinds = {key: kind for key, kind in self._kinds.items() if kind.topic in topics}
+        kinds = {
+            key: kind
+            for key, kind in self._kinds.items()
+            if kind.topic in topics
+        }
         if not kinds:
             return
         blocks = message_blocks(self._messages(kinds, span_ns))
@@ -178,17 +187,20 @@ class Storage(ABC):
             raise
         except Exception as error:
             # rosbags reads SQLite with apsw, whose NoMemError is not a subclass of MemoryError.
-            if isinstance(error, MemoryError) or type(error).__name__ == "NoMemError":
-                why = (
-                    "reading it needs too much memory; the file is damaged or malicious"
-                )
+            if (
+                isinstance(error, MemoryError)
+                or type(error).__name__ == "NoMemError"
+            ):
+                why = "reading it needs too much memory; the file is damaged or malicious"
             else:
                 why = (
                     "it is truncated, damaged or of an unsupported kind "
                     f"({reason_of(error)}); repair it with {self._repair}, or "
                     "record it again"
                 )
-            raise InputError(f"cannot read bag {self.paths[0]}: {why}") from error
+            raise InputError(
+                f"cannot read bag {self.paths[0]}: {why}"
+            ) from error
 
 
 class RosbagsFile(Storage):
@@ -206,13 +218,16 @@ class RosbagsFile(Storage):
         if suffix == ".db3":
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
-            self._repair = "the library for damaged mcap files, 'pip install mcap'"
+            self._repair = (
+                "the library for damaged mcap files, 'pip install mcap'"
+            )
         reader.open()
         opened.callback(reader.close)
         # rosbags reads only the messages in the index of an mcap file, so it must be complete.
         if suffix == ".mcap":
             n_indexed = sum(
-                sum(chunk.channel_count.values()) for chunk in reader.storage.chunks
+                sum(chunk.channel_count.values())
+                for chunk in reader.storage.chunks
             )
             if n_indexed != reader.message_count:
                 raise ValueError("it has no index of its messages")
@@ -221,7 +236,11 @@ class RosbagsFile(Storage):
             language = connection.msgdef.format.name
             definition = connection.msgdef.data.encode()
             kind = kind_of(
-                connection.topic, connection.msgtype, encoding, language, definition
+                connection.topic,
+                connection.msgtype,
+                encoding,
+                language,
+                definition,
             )
             self._kinds[connection.id] = kind
             self.counts[kind] += connection.msgcount
@@ -283,7 +302,11 @@ def _rosbag1_message(chunk: bytes, start: int) -> bytes:
     while not is_message:
         header_end = end + _LENGTH.size + _LENGTH.unpack_from(chunk, end)[0]
         is_message = _MESSAGE_OP in chunk[end:header_end]
-        end = header_end + _LENGTH.size + _LENGTH.unpack_from(chunk, header_end)[0]
+        end = (
+            header_end
+            + _LENGTH.size
+            + _LENGTH.unpack_from(chunk, header_end)[0]
+        )
     if end > len(chunk):
         raise EOFError("a chunk ends in the middle of a record")
     return chunk[header_end + _LENGTH.size : end]

@@ -68,7 +68,9 @@ def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
     world_frame = cursor.name()
     sensor_frame = cursor.name() if row.has_child_frame else None
     values = row.unpack(cursor) if row.unpack else ()
-    return _Unpacked(stamp_ns, world_frame, sensor_frame, values, cursor.position)
+    return _Unpacked(
+        stamp_ns, world_frame, sensor_frame, values, cursor.position
+    )
 
 
 def unpack_poses(
@@ -108,12 +110,16 @@ def _unpack_alike(
     has_same_encoding = is_ros1 or (encodings == encodings[0]).all()
     frames = rows[:, START + STAMP_SIZE : first.end - POSE_SIZE]
     stamps = np.ascontiguousarray(rows[:, START : START + STAMP_SIZE])
-    seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(np.int64)
+    seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(
+        np.int64
+    )
     are_stamps = (nanoseconds // NS_PER_S == 0).all()
     has_same_frames = (frames == frames[0]).all()
     if not (has_same_encoding and are_stamps and has_same_frames):
         return None
-    poses = np.ascontiguousarray(rows[:, first.end - POSE_SIZE : first.end]).view("<f8")
+    poses = np.ascontiguousarray(
+        rows[:, first.end - POSE_SIZE : first.end]
+    ).view("<f8")
     stamps_ns = seconds * NS_PER_S + nanoseconds
     return PoseTable.of(stamps_ns, poses, first.world_frame, first.sensor_frame)
 
@@ -140,14 +146,21 @@ class MessageReader:
     """
 
     def __init__(
-        self, message_type: str, measures: str, origin: LocalOrigin | None = None
+        self,
+        message_type: str,
+        measures: str,
+        origin: LocalOrigin | None = None,
     ) -> None:
         self._row = MESSAGE_TYPES[message_type]
         self._measures = MEASURES[measures].read_as or measures
-        self._are_poses = message_type in POSE_TYPES and self._measures == "poses"
+        self._are_poses = (
+            message_type in POSE_TYPES and self._measures == "poses"
+        )
         self._rates = RateIntegrator()
         # Frames of the previous pose. The first value differs from the bytes of every message.
-        self._frames = _Frames(data=b" ", end=0, world_frame="", sensor_frame=None)
+        self._frames = _Frames(
+            data=b" ", end=0, world_frame="", sensor_frame=None
+        )
         self._origin = origin or LocalOrigin()
         self.n_left_out = 0
 
@@ -185,7 +198,9 @@ class MessageReader:
             target = COLUMNS[
                 "positions" if self._measures == "positions" else "rotations"
             ]
-            measured = self._measured(columns.stamps_ns[is_usable], values[is_usable])
+            measured = self._measured(
+                columns.stamps_ns[is_usable], values[is_usable]
+            )
             poses[is_usable, target] = measured
         poses[~is_usable] = np.nan
         if self._row.name not in SENSOR_TYPES:
@@ -225,13 +240,20 @@ class MessageReader:
             unpacked = _unpack(self._row, False, data)
             end = unpacked.end - POSE_SIZE
             self._frames = _Frames(
-                data[start:end], end, unpacked.world_frame, unpacked.sensor_frame
+                data[start:end],
+                end,
+                unpacked.world_frame,
+                unpacked.sensor_frame,
             )
         frames = self._frames
         pose = struct.unpack_from("<7d", data, frames.end)
         stamp_ns = Cursor(data, False).stamp_ns()
         return PoseFields(
-            stamp_ns, frames.world_frame, frames.sensor_frame, pose[:3], pose[3:]
+            stamp_ns,
+            frames.world_frame,
+            frames.sensor_frame,
+            pose[:3],
+            pose[3:],
         )
 
     def __call__(self, data: bytes) -> PoseFields:
@@ -259,4 +281,6 @@ class MessageReader:
         pose = columns.poses[0].tolist()
         world = columns.world_frames[0]
         sensor = columns.sensor_frames[0]
-        return PoseFields(int(columns.stamps_ns[0]), world, sensor, pose[:3], pose[3:])
+        return PoseFields(
+            int(columns.stamps_ns[0]), world, sensor, pose[:3], pose[3:]
+        )

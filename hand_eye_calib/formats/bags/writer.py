@@ -16,7 +16,9 @@ from hand_eye_calib.formats.files import writing
 Streams = Mapping[str, tuple[Trajectory, str]]
 
 
-def write_bag(path: str | Path, streams: Streams, storage: str = "mcap") -> None:
+def write_bag(
+    path: str | Path, streams: Streams, storage: str = "mcap"
+) -> None:
     """Write trajectories into a new bag; the poses of all topics are sorted by their stamps.
 
     Parameters
@@ -54,22 +56,31 @@ def write_streams(writer: Any, streams: Streams, storage: str) -> None:
     from rosbags.typesys import Stores, get_typestore
 
     is_ros1 = storage == "rosbag1"
-    typestore = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY)
+    typestore = get_typestore(
+        Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY
+    )
     serialize = typestore.serialize_ros1 if is_ros1 else typestore.serialize_cdr
     rows = []
     for topic, (trajectory, message_type) in streams.items():
-        connection = writer.add_connection(topic, message_type, typestore=typestore)
+        connection = writer.add_connection(
+            topic, message_type, typestore=typestore
+        )
         for stamp_ns, message in stamped_messages(
             typestore.types, trajectory, message_type, is_ros1
         ):
             rows.append((stamp_ns, connection, message))
     rows.sort(key=lambda row: row[0])
     for stamp_ns, connection, message in rows:
-        writer.write(connection, stamp_ns, serialize(message, connection.msgtype))
+        writer.write(
+            connection, stamp_ns, serialize(message, connection.msgtype)
+        )
 
 
 def stamped_messages(
-    types: Mapping[str, Any], trajectory: Trajectory, message_type: str, is_ros1: bool
+    types: Mapping[str, Any],
+    trajectory: Trajectory,
+    message_type: str,
+    is_ros1: bool,
 ) -> Iterator[tuple[int, Any]]:
     """Iterate over the stamps (ns) and messages of a trajectory.
 
@@ -81,7 +92,9 @@ def stamped_messages(
 
     zero = make("Vector3", 0.0, 0.0, 0.0)
     no_covariance = np.zeros(36)
-    twist = make("TwistWithCovariance", make("Twist", zero, zero), no_covariance)
+    twist = make(
+        "TwistWithCovariance", make("Twist", zero, zero), no_covariance
+    )
     rows = se3.to_rows(trajectory.poses).tolist()
     for number, stamp_ns in enumerate(trajectory.stamps_ns.tolist()):
         stamp = types["builtin_interfaces/msg/Time"](
@@ -92,7 +105,9 @@ def stamped_messages(
             stamp=stamp, frame_id=trajectory.world_frame, **sequence
         )
         x, y, z, *quat_xyzw = rows[number]
-        pose = make("Pose", make("Point", x, y, z), make("Quaternion", *quat_xyzw))
+        pose = make(
+            "Pose", make("Point", x, y, z), make("Quaternion", *quat_xyzw)
+        )
         parts: tuple[Any, ...] = (pose,)
         if message_type == "nav_msgs/msg/Odometry":
             with_covariance = make("PoseWithCovariance", pose, no_covariance)

@@ -20,7 +20,20 @@ _NUMBER = re.compile(
 )
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(e[-+]?\d+)?", re.IGNORECASE)
 # Texts that programs write for a missing value, in lower case.
-_NULLS = {"", "nan", "-nan", "null", "none", "na", "n/a", "#n/a", "nil", "-", "--", "?"}
+_NULLS = {
+    "",
+    "nan",
+    "-nan",
+    "null",
+    "none",
+    "na",
+    "n/a",
+    "#n/a",
+    "nil",
+    "-",
+    "--",
+    "?",
+}
 # Degrees, minutes and seconds with their signs, and a hemisphere before or after the numbers.
 _ANGLE = re.compile(
     r"(?P<before>[NSEW]?)\s*"
@@ -118,10 +131,14 @@ def _degrees(cell: str) -> float | None:
     if not match or (match["before"] and match["behind"]):
         return None
     numbers = match.group("degrees", "minutes", "seconds")
-    magnitudes = [abs(float(digits.replace(",", "."))) for digits in numbers if digits]
+    magnitudes = [
+        abs(float(digits.replace(",", "."))) for digits in numbers if digits
+    ]
     if max(magnitudes[1:], default=0.0) >= 60:
         return None
-    total = sum(magnitude / 60**power for power, magnitude in enumerate(magnitudes))
+    total = sum(
+        magnitude / 60**power for power, magnitude in enumerate(magnitudes)
+    )
     hemisphere = match["before"] or match["behind"]
     is_negative = match["degrees"].startswith("-") or hemisphere in ("S", "W")
     return -total if is_negative else total
@@ -134,7 +151,9 @@ def splitter(separator: str) -> CellsOf:
 
     def cells_of(line: str) -> list[str]:
         if '"' in line:
-            cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+            cells = next(
+                csv.reader([line], delimiter=separator, skipinitialspace=True)
+            )
         else:
             cells = line.split(separator)
         return [cell.strip() for cell in cells]
@@ -146,7 +165,9 @@ def _split_at_blanks(line: str) -> list[str]:
     """Return the cells of a line that are separated by white space outside quotes."""
     if '"' not in line:
         return line.split()
-    cells = csv.reader([line.replace("\t", " ")], delimiter=" ", skipinitialspace=True)
+    cells = csv.reader(
+        [line.replace("\t", " ")], delimiter=" ", skipinitialspace=True
+    )
     return [cell for cell in next(cells) if cell]
 
 
@@ -160,11 +181,15 @@ def separator_of(lines: Sequence[str]) -> str:
     n_digits = {}
     for separator in _SEPARATORS:
         cells_of = splitter(separator)
-        n_digits[separator] = sum(_digits_in_numbers(cells_of(line)) for line in lines)
+        n_digits[separator] = sum(
+            _digits_in_numbers(cells_of(line)) for line in lines
+        )
     if any(n_digits.values()):
         return max(_SEPARATORS, key=n_digits.__getitem__)
     first_line = lines[0] if lines else ""
-    return next(separator for separator in _SEPARATORS if separator in first_line)
+    return next(
+        separator for separator in _SEPARATORS if separator in first_line
+    )
 
 
 def _digits_in_numbers(cells: Sequence[str]) -> int:
@@ -206,7 +231,9 @@ def _outside_brackets(text: str, separator: str) -> list[str]:
             depth += 1
         elif letter in ")]}" and depth:
             depth -= 1
-        is_separator = letter.isspace() if separator == BLANKS else letter == separator
+        is_separator = (
+            letter.isspace() if separator == BLANKS else letter == separator
+        )
         if is_separator and depth == 0:
             cells.append("")
         else:

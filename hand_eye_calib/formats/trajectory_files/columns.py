@@ -108,7 +108,16 @@ _NAMES = {
 }
 # Names without an underscore that may be the end of a longer name, as in gps_fix_latitude. Other
 # such names ("x", "time") are too common at the end of names of other quantities.
-_ENDS = {"latitude", "longitude", "altitude", "itow", *QUATERNION, "tx", "ty", "tz"}
+_ENDS = {
+    "latitude",
+    "longitude",
+    "altitude",
+    "itow",
+    *QUATERNION,
+    "tx",
+    "ty",
+    "tz",
+}
 # Names of an element of a matrix, at row and column: t_00, r11, rot_1_2, pose.T[0][3].
 _ELEMENT = re.compile(
     r"(?:^|_)(?:m|r|t|h|rot|mat|matrix|rotation|pose|transform|rotm)_?(\d)_?(\d)$"
@@ -137,7 +146,9 @@ _UNIT_NAMES = {
     "us": "us usec µs μs microsecond microseconds",
     "ns": "ns nanosecond nanoseconds",
 }
-_UNITS = {name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()}
+_UNITS = {
+    name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()
+}
 # Names of units in brackets. Some of them mean something else at the end of a name: stamp_sec is a
 # quantity, the whole seconds of a stamp.
 _UNITS_IN_BRACKETS = {
@@ -154,7 +165,9 @@ _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
 _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 
 
-def named_columns(names: Sequence[str]) -> tuple[dict[str, list[int]], list[str]]:
+def named_columns(
+    names: Sequence[str],
+) -> tuple[dict[str, list[int]], list[str]]:
     """Return the columns of each quantity, and the unit in the name of each column.
 
     A column belongs to a quantity if its name is one of the quantity's names. If a quantity has no
@@ -199,7 +212,9 @@ def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
     places = [place for place, name in enumerate(plain) if name in aliases]
     if places:
         return places
-    ends = tuple(f"_{alias}" for alias in aliases if "_" in alias or alias in _ENDS)
+    ends = tuple(
+        f"_{alias}" for alias in aliases if "_" in alias or alias in _ENDS
+    )
     return [place for place, name in enumerate(plain) if name.endswith(ends)]
 
 
@@ -222,7 +237,9 @@ def _elements(
     places_of: dict[tuple[int, int], list[int]] = {}
     for place, name in enumerate(plain):
         if match := _ELEMENT.search(name):
-            places_of.setdefault((int(match[1]), int(match[2])), []).append(place)
+            places_of.setdefault((int(match[1]), int(match[2])), []).append(
+                place
+            )
     # Names that count from 0 have an element 00.
     shift = 1 if (0, 0) in places_of else 0
     elements = {
@@ -256,7 +273,8 @@ def measured(
     """
     position = _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns)
     orientation = (
-        _first_group((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), columns) or QUATERNION
+        _first_group((*_ORIENTATIONS, *_PLANAR_ORIENTATIONS), columns)
+        or QUATERNION
     )
     has_matrix = {*ROTATION} <= columns.keys()
     if measures == "auto":
@@ -266,7 +284,10 @@ def measured(
             return measures, MATRIX
         # A pose without a height is accepted only if its orientation is a yaw or a heading alone,
         # as for a vehicle on a plane.
-        if position in PLANAR_POSITIONS and orientation not in _PLANAR_ORIENTATIONS:
+        if (
+            position in PLANAR_POSITIONS
+            and orientation not in _PLANAR_ORIENTATIONS
+        ):
             position = ()
         return measures, (*(position or POSITION), *orientation)
     quantities: dict[str, Sequence[str]] = {
@@ -294,8 +315,8 @@ def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     """
     listed = ",".join(plain_name(name) for name in names)
     if _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns):
-        has_orientation = columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(
-            listed
+        has_orientation = (
+            columns.keys() & _ORIENTATION_QUANTITIES or _ORIENTED.search(listed)
         )
         return "poses" if has_orientation else "positions"
     if columns.keys() & _POSITION_QUANTITIES:
@@ -361,7 +382,9 @@ def _split(name: str) -> tuple[str, str]:
         r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name
     )
     # Remove brackets with their content. Text after a bracket that is not closed is kept.
-    outside = _BRACKETS.sub(lambda match: "" if match[2] else f" {match[1]}", name)
+    outside = _BRACKETS.sub(
+        lambda match: "" if match[2] else f" {match[1]}", name
+    )
     words = re.findall("[a-z0-9°µμ]+", outside)
     in_brackets = [match[1] for match in _BRACKETS.finditer(name) if match[2]]
     if in_brackets and name.endswith(("]", ")")):
@@ -381,7 +404,11 @@ def _split_words(words: list[str]) -> tuple[str, str]:
     A unit of time belongs to a name with a word of time, and other units to names without one.
     """
     # The number of a coefficient or axis, as in q_0 and position_1, belongs to the name.
-    if len(words) > 1 and words[-1].isdigit() and words[-2] in ("q", "position"):
+    if (
+        len(words) > 1
+        and words[-1].isdigit()
+        and words[-2] in ("q", "position")
+    ):
         return "_".join(words[:-1]) + words[-1], ""
     is_time = any(_TIME_WORD.fullmatch(word) for word in words)
     for n_words in (2, 1):

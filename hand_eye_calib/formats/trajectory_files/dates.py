@@ -147,9 +147,16 @@ def _time_of_day(text: str) -> Decimal:
     match = _TIME.fullmatch(text)
     if not match:
         raise ValueError("no time of day")
-    hour_text, separator, minute_text, second_text, point, digits, half, zone = (
-        match.groups()
-    )
+    (
+        hour_text,
+        separator,
+        minute_text,
+        second_text,
+        point,
+        digits,
+        half,
+        zone,
+    ) = match.groups()
     hour = _hour_of_day(int(hour_text), half)
     minute = int(minute_text)
     second = int(second_text or 0)
@@ -160,7 +167,10 @@ def _time_of_day(text: str) -> Decimal:
         # After a separator as in 12:30:05:25, the digits are a number of ms, us or ns.
         is_number = point == separator and point != "."
         fraction = _fraction(digits, is_number)
-    return Decimal(3600 * hour + 60 * minute + second - _zone_s(zone or "")) + fraction
+    return (
+        Decimal(3600 * hour + 60 * minute + second - _zone_s(zone or ""))
+        + fraction
+    )
 
 
 def _hour_of_day(hour: int, half: str | None) -> int:
@@ -193,7 +203,9 @@ def _zone_s(zone: str) -> int:
 # ---- stamp of a row
 
 
-def stamp_of(names: Sequence[str], cells: Sequence[str], unit: str = "") -> Decimal:
+def stamp_of(
+    names: Sequence[str], cells: Sequence[str], unit: str = ""
+) -> Decimal:
     """Return the stamp of a row with all its digits.
 
     Parameters
@@ -242,7 +254,9 @@ def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
         if second_of_week < 2 * WEEK_S:
             week = Decimal(week_text)
             if week != int(week) or not 0 <= week < 10_000:
-                raise ValueError(f"found {week_text[:20]!r} for the week of GPS")
+                raise ValueError(
+                    f"found {week_text[:20]!r} for the week of GPS"
+                )
             return GPS_EPOCH_S + WEEK_S * int(week) + second_of_week
     return second
 

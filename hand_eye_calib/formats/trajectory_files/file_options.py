@@ -4,7 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hand_eye_calib.core.base.config import PAIR_BY, STAMP_UNITS, TRAJECTORY_FORMATS
+from hand_eye_calib.core.base.config import (
+    PAIR_BY,
+    STAMP_UNITS,
+    TRAJECTORY_FORMATS,
+)
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import did_you_mean
 
@@ -37,8 +41,12 @@ class FileOptions:
     pair_by: str = PAIR_BY[0]
 
     def __post_init__(self) -> None:
-        _refuse_unknown("unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,))
-        _refuse_unknown("trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO))
+        _refuse_unknown(
+            "unit of stamps", self.stamp_unit or "s", (*STAMP_UNITS,)
+        )
+        _refuse_unknown(
+            "trajectory format", self.format, (*TRAJECTORY_FORMATS, AUTO)
+        )
         reason = ""
         if self.columns is not None and self.format not in ("csv", AUTO):
             reason = "columns can be set for format csv only"

@@ -33,7 +33,10 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     is_pose,
     named_columns,
 )
-from hand_eye_calib.formats.trajectory_files.dates import is_date, is_date_or_time
+from hand_eye_calib.formats.trajectory_files.dates import (
+    is_date,
+    is_date_or_time,
+)
 from hand_eye_calib.formats.trajectory_files.recognition import (
     STAMPED_POSE,
     TRANSPOSABLE,
@@ -121,7 +124,9 @@ def lines_of(
                 f"{path}, line {line_number}: longer than {LONGEST_LINE} characters"
             )
         line = match[0]
-        if after is None or (line_number > after and not line.startswith(COMMENTS)):
+        if after is None or (
+            line_number > after and not line.startswith(COMMENTS)
+        ):
             yield line_number, line.rstrip()
 
 
@@ -166,7 +171,9 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
     return _with_fitting_columns(layout, rows, is_separated)
 
 
-def _layout_without_rows(lines: Sequence[tuple[int, str]], separator: str) -> Layout:
+def _layout_without_rows(
+    lines: Sequence[tuple[int, str]], separator: str
+) -> Layout:
     """Return the layout of a text without rows of numbers, whose last line may name the columns."""
     split = splitter(separator)
     if not lines:
@@ -210,14 +217,18 @@ def _lines_above_rows(cells: Sequence[list[str]]) -> int | None:
     first = cells.index(_usual_row([cells[line] for line in rows]))
     # Rows with another number of cells may precede the first usual row. They belong to the rows,
     # so the text ends at the last line before the usual row that is not a row.
-    return 1 + max((line for line in range(first) if line not in rows), default=-1)
+    return 1 + max(
+        (line for line in range(first) if line not in rows), default=-1
+    )
 
 
 def _is_row(cells: Sequence[str]) -> bool:
     """Whether a line is a row of numbers; at least half of its cells must be values."""
     filled = [cell for cell in cells if cell]
     n_values = sum(map(is_value, filled))
-    has_number = any(is_number(cell) or is_date_or_time(cell) for cell in filled)
+    has_number = any(
+        is_number(cell) or is_date_or_time(cell) for cell in filled
+    )
     return has_number and n_values >= _MIN_SHARE_OF_VALUES * len(filled)
 
 
@@ -325,7 +336,9 @@ def _refuse_other_number_of_names(
     for line_number, line in lines:
         names = names_in(line, separator)[0]
         if _are_names_of_quantities(names) and len(row) > 1:
-            advice = "write one name for each column, or name all with `columns`"
+            advice = (
+                "write one name for each column, or name all with `columns`"
+            )
             if len(row) > len(names) and separator == "," and are_whole(row):
                 advice = DECIMAL_COMMAS
             raise InputError(
@@ -338,7 +351,11 @@ def _are_names_of_quantities(names: Sequence[str]) -> bool:
     """Whether the names include those of a position, an orientation, rates or a pose."""
     by_name, _ = named_columns(names)
     columns = by_name.keys()
-    return is_pose(columns) or {"x", "qw"} <= columns or {"roll", "pitch"} <= columns
+    return (
+        is_pose(columns)
+        or {"x", "qw"} <= columns
+        or {"roll", "pitch"} <= columns
+    )
 
 
 def _header_if_fitting(
@@ -393,10 +410,14 @@ _HEMISPHERES = {"N", "S", "E", "W"}
 def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
     """Return the first column of each quantity; quantities without a column are skipped."""
     columns = named_columns(names)[0]
-    return {columns[quantity][0] for quantity in quantities if quantity in columns}
+    return {
+        columns[quantity][0] for quantity in quantities if quantity in columns
+    }
 
 
-def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> list[int]:
+def _widths(
+    names: Sequence[str], row: Sequence[str], n_angle_cells: int
+) -> list[int]:
     """Return the number of cells in a row that belong to each name.
 
     A latitude or longitude has ``n_angle_cells`` cells, and one more for a hemisphere; a stamp may
@@ -414,7 +435,9 @@ def _widths(names: Sequence[str], row: Sequence[str], n_angle_cells: int) -> lis
             width = 0
         elif column in angles:
             end = n_used_cells + n_angle_cells
-            width = n_angle_cells + len(_HEMISPHERES.intersection(row[end : end + 1]))
+            width = n_angle_cells + len(
+                _HEMISPHERES.intersection(row[end : end + 1])
+            )
         elif column in stamps and not has_name_for_each_cell:
             width = 2 if _is_split_stamp(row[n_used_cells:]) else 1
         widths.append(width)
@@ -431,7 +454,9 @@ def _with_degrees(names: Sequence[str], row: Sequence[str]) -> tuple[str, ...]:
     return tuple(with_units)
 
 
-def _with_units(names: tuple[str, ...], below: str, separator: str) -> tuple[str, ...]:
+def _with_units(
+    names: tuple[str, ...], below: str, separator: str
+) -> tuple[str, ...]:
     """Append the units in the line below the names, if this line has one unit for each name."""
     for units in names_in(below, separator) if below else []:
         if len(units) == len(names) and not _is_row(units):
@@ -442,9 +467,13 @@ def _with_units(names: tuple[str, ...], below: str, separator: str) -> tuple[str
 def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
     """Rename a first column with an unknown name to "t" if it contains stamps since 1970."""
     columns = named_columns(names)[0].keys()
-    has_stamp = not columns.isdisjoint({"t", "secs", *named_columns(names[:1])[0]})
+    has_stamp = not columns.isdisjoint(
+        {"t", "secs", *named_columns(names[:1])[0]}
+    )
     return (
-        names if has_stamp or not _SINCE_1970.fullmatch(row[0]) else ("t", *names[1:])
+        names
+        if has_stamp or not _SINCE_1970.fullmatch(row[0])
+        else ("t", *names[1:])
     )
 
 

@@ -57,7 +57,9 @@ _MATHEMATICAL = "counterclockwise from x (east)"
 # The angles are those of the inverse rotation, as in the library pyboreas.
 _INVERSE = "that of the world in the sensor's frame"
 # The rotations about x, y and z are applied in the opposite order.
-_OTHER_ORDER = "counterclockwise from x, about the axis that roll and pitch have turned"
+_OTHER_ORDER = (
+    "counterclockwise from x, about the axis that roll and pitch have turned"
+)
 # A sensor remains level if the scatter of the vertical direction in its axes, 1 minus the length of
 # the mean direction, is at most this value: about 1 minus the cosine of 2.5 deg.
 _LEVEL = 1e-3
@@ -154,7 +156,8 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     nearest = se3.nearest_rotation(matrices[:, :, :3])
     table.refuse(
         np.asarray(
-            np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2)) > ROTATION_TOLERANCE
+            np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2))
+            > ROTATION_TOLERANCE
         ),
         lambda _: (
             f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
@@ -195,7 +198,9 @@ def _in_axes_of_earth(
     rotations = _rotations_of(quats_xyzw)
     candidates = {
         "the axes of the earth, too": quats_xyzw,
-        "east, north and up at each position (ENU)": se3.to_quat_xyzw(axes @ rotations),
+        "east, north and up at each position (ENU)": se3.to_quat_xyzw(
+            axes @ rotations
+        ),
         "north, east and down at each position (NED)": se3.to_quat_xyzw(
             axes @ _R_ENU_NED @ rotations
         ),
@@ -203,10 +208,16 @@ def _in_axes_of_earth(
     fitting = _conventions_that_fit(positions, candidates)
     if len(fitting) > 1:
         up = axes[:, :, 2]
-        scatters = {name: _scatter_in_sensor(candidates[name], up) for name in fitting}
+        scatters = {
+            name: _scatter_in_sensor(candidates[name], up) for name in fitting
+        }
         largest = max(WRONG_SCATTER_RATIO * min(scatters.values()), _LEVEL)
         fitting = [name for name in fitting if scatters[name] <= largest]
-    reason = ", because the motion fits that" if len(fitting) < len(candidates) else ""
+    reason = (
+        ", because the motion fits that"
+        if len(fitting) < len(candidates)
+        else ""
+    )
     table.guess(
         "positions count from the centre of the earth (ECEF); orientations read as relative to "
         f"{fitting[0]}{reason}"
@@ -239,7 +250,9 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
             "is 90 deg: check whether both are swapped"
         ),
     )
-    height_m = _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat_rad))
+    height_m = (
+        _in_si(table, up, "length")[:, 0] if up else np.zeros(len(lat_rad))
+    )
     table.guess(
         "latitude and longitude became metres east and north of the first position"
     )
@@ -265,7 +278,9 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     if kind != "length":
         table.refuse(
             magnitudes > FARTHEST_M,
-            lambda row: f"found {kind} {magnitudes[row]:.4g}; repair its source",
+            lambda row: (
+                f"found {kind} {magnitudes[row]:.4g}; repair its source"
+            ),
         )
     if units:
         unit = units.pop()
@@ -275,7 +290,9 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     # The first two units are those of columns without a unit.
     first, second, *_ = factors
     largest = float(magnitudes.max())
-    unit, other = (second, first) if largest > largest_of_first else (first, second)
+    unit, other = (
+        (second, first) if largest > largest_of_first else (first, second)
+    )
     if kind != "length":
         table.guess(
             f"{', '.join(names)} read in {unit}, the largest is "
@@ -285,7 +302,9 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     return values * factors[unit]
 
 
-def _refuse_degrees(table: Table, names: Sequence[str], values: FloatArray) -> None:
+def _refuse_degrees(
+    table: Table, names: Sequence[str], values: FloatArray
+) -> None:
     """Raise an InputError if columns that are named as radians probably contain degrees.
 
     Angles of more than one turn are degrees, except for a yaw or heading, which may count turns
@@ -321,7 +340,9 @@ def _refuse_degrees(table: Table, names: Sequence[str], values: FloatArray) -> N
 # ---- orientations
 
 
-def _orientations(table: Table, positions: FloatArray, convention: str) -> FloatArray:
+def _orientations(
+    table: Table, positions: FloatArray, convention: str
+) -> FloatArray:
     """Return quaternions (N, 4), scalar last; the identity if the table has no orientations."""
     for names in (QUATERNION, SCALAR_FIRST, UNNAMED):
         if names[0] in table.at:
@@ -350,7 +371,9 @@ def _of_quaternions(
         return quats
     # Quaternions with the scalar last, if the file has the scalar last or first.
     candidates = {"last": quats, "first": np.roll(quats, -1, axis=1)}
-    usual, opposite = ("first", "last") if names == SCALAR_FIRST else ("last", "first")
+    usual, opposite = (
+        ("first", "last") if names == SCALAR_FIRST else ("last", "first")
+    )
     fitting = _conventions_that_fit(positions, candidates)
     # An odometry begins with the identity, whose scalar is 1 or -1.
     begins_with_identity = {
@@ -414,7 +437,9 @@ def _require_rotation_vectors(table: Table) -> None:
     table.guess("rx, ry, rz read as a rotation vector, as of Universal Robots")
 
 
-def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArray:
+def _of_angles(
+    table: Table, positions: FloatArray, convention: str
+) -> FloatArray:
     """Return quaternions (N, 4), scalar last, of roll, pitch and yaw or heading.
 
     Angles are about the fixed axes x, y and z. The axes of the body are x forward, y left and z up,
@@ -422,7 +447,9 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     in INS. If it has a yaw, the pitch is about y, as in REP 103. ``convention`` is used instead of
     the convention inferred from the motion, unless it is empty.
     """
-    names = [name for name in ("roll", "pitch", "yaw", "heading") if name in table.at]
+    names = [
+        name for name in ("roll", "pitch", "yaw", "heading") if name in table.at
+    ]
     *tilt, angle = _in_si(table, names, "angle").T
     if not tilt:
         table.guess("no columns of roll and pitch: 0 is assumed")
@@ -447,13 +474,17 @@ def _of_angles(table: Table, positions: FloatArray, convention: str) -> FloatArr
     if expected == _COMPASS or used != expected:
         reason = ""
         if convention:
-            reason = ", because that fits the other file with the same columns, too"
+            reason = (
+                ", because that fits the other file with the same columns, too"
+            )
         elif used != expected:
             reason = ", because the motion fits that and not the usual"
         axes = "x forward, y left, z up"
         if used == _INVERSE:
             axes = "x, y, z of the world where all angles are 0"
-        table.guess(f"{names[-1]} read as {used}{reason}; axes of the sensor: {axes}")
+        table.guess(
+            f"{names[-1]} read as {used}{reason}; axes of the sensor: {axes}"
+        )
     return candidates[used]
 
 
@@ -473,10 +504,14 @@ def _conventions_that_fit(
         Orientations xyzw of the sensor in its world, in each convention.
     """
     scatters = {
-        convention: scatter_of_direction(se3.from_quat_xyzw(positions, quats_xyzw))
+        convention: scatter_of_direction(
+            se3.from_quat_xyzw(positions, quats_xyzw)
+        )
         for convention, quats_xyzw in candidates.items()
     }
     largest = max(STEADY_SCATTER, WRONG_SCATTER_RATIO * min(scatters.values()))
     return [
-        convention for convention, scatter in scatters.items() if scatter <= largest
+        convention
+        for convention, scatter in scatters.items()
+        if scatter <= largest
     ]

@@ -26,7 +26,10 @@ from hand_eye_calib.core.base.text import (
 )
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.formats.files import local_path
-from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
 from hand_eye_calib.formats.trajectory_files.poses import poses_of
 from hand_eye_calib.formats.trajectory_files.stamps import (
     in_order,
@@ -125,10 +128,16 @@ def read_trajectory(
     """
     if isinstance(source, Trajectory):
         return source
-    path = local_path(fspath(source)) if isinstance(source, str | PathLike) else None
+    path = (
+        local_path(fspath(source))
+        if isinstance(source, str | PathLike)
+        else None
+    )
     file_of_times = Path(times) if isinstance(times, str | PathLike) else None
     is_format_set = format not in (FileOptions.format, AUTO)
-    has_file_options = is_format_set or columns is not None or file_of_times is not None
+    has_file_options = (
+        is_format_set or columns is not None or file_of_times is not None
+    )
     has_times_in_memory = times is not None and file_of_times is None
     if topic:
         has_other_options = any(
@@ -148,7 +157,9 @@ def read_trajectory(
         repair=repair,
         measures=measures,
     )
-    table = read_table(path, options) if path else table_of_object(source, times)
+    table = (
+        read_table(path, options) if path else table_of_object(source, times)
+    )
     reading = _read(table, options)
     _warn_of(reading)
     return reading.trajectory
@@ -222,18 +233,23 @@ def read_trajectory_files(
         rows_of_tables = _rows_without_stamps(tables, pair_by)
     readings = [
         _read(table, options, rows)
-        for (_, options), table, rows in zip(files, tables, rows_of_tables, strict=True)
+        for (_, options), table, rows in zip(
+            files, tables, rows_of_tables, strict=True
+        )
     ]
     for number, convention in _corrected_conventions(tables).items():
         path, options = files[number]
         # Read the table again, because its notes report the convention that it was read with.
         table = read_table(path, options)
-        readings[number] = _read(table, options, rows_of_tables[number], convention)
+        readings[number] = _read(
+            table, options, rows_of_tables[number], convention
+        )
     names = _sensor_names([path for path, _ in files])
     return [
         reading._replace(
             trajectory=replace(
-                reading.trajectory, sensor_frame=reading.trajectory.sensor_frame or name
+                reading.trajectory,
+                sensor_frame=reading.trajectory.sensor_frame or name,
             )
         )
         for reading, name in zip(readings, names, strict=True)
@@ -254,11 +270,15 @@ def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
     conventions = {}
     for names in {table.names for table in tables if table.conventions}:
         numbers = [
-            number for number, table in enumerate(tables) if table.names == names
+            number
+            for number, table in enumerate(tables)
+            if table.names == names
         ]
         common = tables[numbers[0]].conventions
         for number in numbers:
-            common = [name for name in common if name in tables[number].conventions]
+            common = [
+                name for name in common if name in tables[number].conventions
+            ]
         if not common:
             raise InputError(
                 f"{' and '.join(str(tables[number].path) for number in numbers)} "
@@ -305,7 +325,9 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
     return [reading.trajectory for reading in readings]
 
 
-def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray]:
+def _rows_without_stamps(
+    tables: Sequence[Table], pair_by: str
+) -> list[IntArray]:
     """Pair the poses of several tables by their row, or by the name of their image.
 
     For each table, the indices (N,) of its poses are returned; the poses at index i of all tables
@@ -313,7 +335,9 @@ def _rows_without_stamps(tables: Sequence[Table], pair_by: str) -> list[IntArray
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
-        counts = listing([f"{table.n_rows:,} in {table.path}" for table in tables])
+        counts = listing(
+            [f"{table.n_rows:,} in {table.path}" for table in tables]
+        )
         paths = shlex.join(str(table.path) for table in tables)
         raise InputError(
             f"pairing by row needs as many poses in each file; found {counts}: write a row for "
@@ -376,7 +400,10 @@ def _read(
     else:
         positions, quats_xyzw = values
         trajectory = Trajectory.from_quat_xyzw(
-            stamps_ns[rows], positions[rows], quats_xyzw[rows], table.sensor_frame
+            stamps_ns[rows],
+            positions[rows],
+            quats_xyzw[rows],
+            table.sensor_frame,
         )
     if table.measures not in ("poses", "rates"):
         table.guess(f"{table.measures} only, by its columns")

@@ -13,7 +13,11 @@ from hand_eye_calib.core.geometry.trajectory import (
     QUATERNION_NORM_TOLERANCE,
     ROTATION_TOLERANCE,
 )
-from hand_eye_calib.formats.trajectory_files.cells import is_number, is_value, number
+from hand_eye_calib.formats.trajectory_files.cells import (
+    is_number,
+    is_value,
+    number,
+)
 from hand_eye_calib.formats.trajectory_files.columns import (
     LAST_ROW,
     MATRIX,
@@ -92,7 +96,9 @@ def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
     for pose in _POSES:
         for stamp in stamps:
             columns = (*stamp, *pose)
-            if len(columns) == values.shape[1] and _fits(pose, values[:, len(stamp) :]):
+            if len(columns) == values.shape[1] and _fits(
+                pose, values[:, len(stamp) :]
+            ):
                 return columns
     return None
 
@@ -107,7 +113,11 @@ def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
         # Any number of columns may follow a position and a quaternion; only those of a covariance
         # may follow other poses.
         may_have_more = pose == STAMPED_POSE[1:] or n_more in _COVARIANCES
-        if n_more > 0 and may_have_more and _fits(pose, values[:, 1 : 1 + len(pose)]):
+        if (
+            n_more > 0
+            and may_have_more
+            and _fits(pose, values[:, 1 : 1 + len(pose)])
+        ):
             return ("t", *pose, *[""] * n_more)
     return None
 
@@ -152,7 +162,9 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
     if LAST_ROW[0] not in pose:
         return True
     last_rows = _values_of(LAST_ROW, pose, values)
-    return bool(np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE))
+    return bool(
+        np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], atol=ROTATION_TOLERANCE)
+    )
 
 
 def _values_of(

@@ -38,7 +38,9 @@ _SAME = 1e-12
 
 def _without_stamps(table: Table) -> str:
     """Return the message for a table without stamps."""
-    remedy = "name their column t, set `times`, or pair poses by row with `pair_by`"
+    remedy = (
+        "name their column t, set `times`, or pair poses by row with `pair_by`"
+    )
     if not isinstance(table.path, Path):
         remedy = (
             "read them with read_trajectory(poses, times=stamps); stops without stamps are for "
@@ -70,7 +72,11 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         raise InputError(_without_stamps(table))
     unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
-    if not unit and min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:
+    if (
+        not unit
+        and min(stamps) >= _FIRST_PACKED
+        and max(stamps) < _END_OF_PACKED
+    ):
         stamps = _unpacked(stamps)
     magnitudes = np.abs(np.array(stamps, dtype=float))
     recognised = unit or _unit_of_magnitude(magnitudes.max())
@@ -82,7 +88,9 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
             f"{recognised}; set its unit with `stamp_unit`"
         ),
     )
-    nanoseconds = (int((stamp * factor).to_integral_value()) for stamp in stamps)
+    nanoseconds = (
+        int((stamp * factor).to_integral_value()) for stamp in stamps
+    )
     stamps_ns = np.fromiter(nanoseconds, dtype=np.int64, count=len(stamps))
     # Only stamps in seconds have decimals, so the unit of stamps with decimals is clear.
     if not unit and not any(stamp % 1 for stamp in stamps):
@@ -111,7 +119,9 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
         return stamps
 
 
-def _refuse_unclear_unit(table: Table, stamps_ns: IntArray, recognised: str) -> None:
+def _refuse_unclear_unit(
+    table: Table, stamps_ns: IntArray, recognised: str
+) -> None:
     """Raise an InputError if the time between poses is so long that the unit is probably wrong."""
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
@@ -138,7 +148,9 @@ def _without_restarts(stamps_ns: IntArray, period_s: int) -> IntArray:
     return stamps_ns + np.cumsum(restarts) * period_ns
 
 
-def refuse_coarse(table: Table, stamps_ns: IntArray, values: FloatArray) -> None:
+def refuse_coarse(
+    table: Table, stamps_ns: IntArray, values: FloatArray
+) -> None:
     """Raise an InputError if the stamps (N,) of a table have lost their last digits.
 
     The criterion: many poses have the stamp of the pose before, but other ``values`` (N, k).
@@ -174,8 +186,14 @@ def _step_of_32_bits(different: IntArray) -> float:
     """
     step_s = float(np.spacing(np.float32(different[-1] / _NS)))
     is_multiple = not (different % max(1, round(step_s * _NS))).any()
-    are_adjacent = len(different) == 1 or np.diff(different).min() < 2.0 * step_s * _NS
-    return step_s if step_s >= _SHORT_STEP_S and is_multiple and are_adjacent else 0.0
+    are_adjacent = (
+        len(different) == 1 or np.diff(different).min() < 2.0 * step_s * _NS
+    )
+    return (
+        step_s
+        if step_s >= _SHORT_STEP_S and is_multiple and are_adjacent
+        else 0.0
+    )
 
 
 def in_order(

@@ -124,14 +124,17 @@ class Table:
     def __post_init__(self) -> None:
         columns, units = named_columns(self.names)
         self.expected = (
-            self.expected or f"{len(self.names)} columns: {self._listed(self.names)}"
+            self.expected
+            or f"{len(self.names)} columns: {self._listed(self.names)}"
         )
         self.measures, quantities = measured(columns, self.names, self.measures)
         self.stamp_names = stamp_columns(columns)
         self._refuse_unclear_columns(columns, quantities)
         self.at = {name: columns[name][0] for name in quantities}
         self.units = {
-            name: units[column] for name, column in self.at.items() if units[column]
+            name: units[column]
+            for name, column in self.at.items()
+            if units[column]
         }
         self.stamp_at = [columns[name][0] for name in self.stamp_names]
         self._set_stamp_units(units)
@@ -151,7 +154,9 @@ class Table:
         if missing := [name for name in quantities if name not in columns]:
             listed = self._listed(self.names)
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
-            no_pose = " (accelerations contain no pose)" if has_accelerations else ""
+            no_pose = (
+                " (accelerations contain no pose)" if has_accelerations else ""
+            )
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among "
                 f"{listed}{no_pose}; name all columns with `columns`, such as "
@@ -209,7 +214,9 @@ class Table:
         )
 
     def fill(
-        self, lines: Iterable[tuple[int, Any]], cells_of: Callable[[Any], Sequence[str]]
+        self,
+        lines: Iterable[tuple[int, Any]],
+        cells_of: Callable[[Any], Sequence[str]],
     ) -> Self:
         """Add rows, and return this table.
 
@@ -232,7 +239,9 @@ class Table:
             rows = [cells_of(content) for _, content in numbered]
             if self._add_at_once(rows, line_numbers):
                 continue
-            for (line_number, content), cells in zip(numbered, rows, strict=True):
+            for (line_number, content), cells in zip(
+                numbered, rows, strict=True
+            ):
                 self._add_row(cells, line_number, content)
         if 1 < len(self._sensors) <= _MOST_SENSORS:
             column = self.names[self._sensor_at[0]]
@@ -260,7 +269,9 @@ class Table:
         if self._orientation_at:
             is_pose &= values[:, self._orientation_at].any(axis=1)
         if stamps is not None:
-            is_pose &= np.array([stamp is not None for stamp in stamps], dtype=bool)
+            is_pose &= np.array(
+                [stamp is not None for stamp in stamps], dtype=bool
+            )
             stamps_and_uses = zip(stamps, is_pose, strict=True)
             self.stamps += [
                 stamp
@@ -305,7 +316,9 @@ class Table:
         self._add_arrays(values, stamps, line_numbers)
         return True
 
-    def _add_row(self, cells: Sequence[str], line_number: int, content: object) -> None:
+    def _add_row(
+        self, cells: Sequence[str], line_number: int, content: object
+    ) -> None:
         """Add the row of one line.
 
         Raises
@@ -319,7 +332,9 @@ class Table:
             self._add(cells, line_number)
         except ValueError as error:
             reason = f"expected {self.expected}; {shortened(str(error))}"
-            raise InputError(f"{self.path}, line {line_number}: {reason}") from None
+            raise InputError(
+                f"{self.path}, line {line_number}: {reason}"
+            ) from None
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
         """Add a row; if it has no pose, count it only.
@@ -349,7 +364,9 @@ class Table:
             return True
         texts = [cells[column] for column in self.stamp_at]
         try:
-            self.stamps.append(stamp_of(self.stamp_names, texts, self.second_unit))
+            self.stamps.append(
+                stamp_of(self.stamp_names, texts, self.second_unit)
+            )
         except ValueError:
             if any(map(is_null, texts)):
                 return False
@@ -380,7 +397,9 @@ class Table:
         """Whether the values of a row are finite, and its orientation is not all 0."""
         # Check the sum first, because this is fast: if it is finite, all values are. But the sum of
         # large finite values may be infinite.
-        if not math.isfinite(sum(values)) and not all(map(math.isfinite, values)):
+        if not math.isfinite(sum(values)) and not all(
+            map(math.isfinite, values)
+        ):
             return False
         return not self._orientation_at or any(
             values[place] for place in self._orientation_at
@@ -403,7 +422,9 @@ class Table:
             return cells[:-1]
         if n_missing > 0 and self.stamp_at and max(self.stamp_at) < len(cells):
             others = [
-                cell for column, cell in enumerate(cells) if column not in self.stamp_at
+                cell
+                for column, cell in enumerate(cells)
+                if column not in self.stamp_at
             ]
             if all(map(is_null, others)):
                 return [*cells, *[""] * n_missing]
@@ -416,7 +437,9 @@ class Table:
         """Add a note for the user about a property that the file does not state."""
         self.guesses.append(f"{self.path}: {text}")
 
-    def refuse(self, is_wrong: BoolArray, message: Callable[[int], str]) -> None:
+    def refuse(
+        self, is_wrong: BoolArray, message: Callable[[int], str]
+    ) -> None:
         """Raise an InputError at the first row for which ``is_wrong`` (N,) is true."""
         index = int(np.argmax(is_wrong))
         if is_wrong[index]:
@@ -434,7 +457,9 @@ _KINDS = (
 )
 
 
-def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]:
+def columns_of_array(
+    source: Any,
+) -> tuple[Sequence[str], FloatArray, list[str]]:
     """Return the columns of an array of poses.
 
     Parameters
@@ -458,7 +483,9 @@ def columns_of_array(source: Any) -> tuple[Sequence[str], FloatArray, list[str]]
     try:
         values = np.asarray(source, dtype=float)
     except (TypeError, ValueError):
-        raise InputError(f"expected {_KINDS}; found {type(source).__name__}") from None
+        raise InputError(
+            f"expected {_KINDS}; found {type(source).__name__}"
+        ) from None
     if values.shape[1:] in ((3, 4), (4, 4)):
         return _columns_of_matrices(values)
     names = ("t", *POSITION, *QUATERNION)
@@ -495,7 +522,9 @@ def _has_last_row(matrices: FloatArray) -> bool:
     is_zero = ~matrices.any(axis=(1, 2))
     last_rows = matrices[is_finite & ~is_zero, 3]
     return bool(
-        np.allclose(last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE)
+        np.allclose(
+            last_rows, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=ROTATION_TOLERANCE
+        )
     )
 
 
@@ -512,7 +541,8 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         keys = [*source.columns]
         table = Table("the table", [*map(str, keys)], expected=_KINDS)
         columns = [
-            np.asarray(source[keys[place]], dtype=float) for place in table.at.values()
+            np.asarray(source[keys[place]], dtype=float)
+            for place in table.at.values()
         ]
         values = np.column_stack(columns)
         if times is None:
@@ -528,7 +558,9 @@ def table_of_object(source: Any, times: Any = None) -> Table:
         table = Table("the poses", names, expected=_KINDS)
         for note in notes:
             table.guess(note)
-    stamps = None if times is None else _stamps_of_objects(times, table, len(values))
+    stamps = (
+        None if times is None else _stamps_of_objects(times, table, len(values))
+    )
     table.fill_from_arrays(values, stamps)
     return table
 
@@ -538,10 +570,14 @@ def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
     if len(columns) < 2:
         return columns[0] if columns else None
     rows = zip(*(map(str, column) for column in columns), strict=True)
-    return [stamp_of(table.stamp_names, cells, table.second_unit) for cells in rows]
+    return [
+        stamp_of(table.stamp_names, cells, table.second_unit) for cells in rows
+    ]
 
 
-def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal | None]:
+def _stamps_of_objects(
+    times: Any, table: Table, n_poses: int
+) -> list[Decimal | None]:
     """Return the stamp of each pose, from numbers or datetimes; None for a missing time.
 
     For datetimes, this also sets the unit of the table's stamps to ns.
@@ -570,5 +606,7 @@ def _stamps_of_objects(times: Any, table: Table, n_poses: int) -> list[Decimal |
         )
     return [
         Decimal(stamp) if is_valid else None
-        for stamp, is_valid in zip(stamps.tolist(), is_time.tolist(), strict=True)
+        for stamp, is_valid in zip(
+            stamps.tolist(), is_time.tolist(), strict=True
+        )
     ]

@@ -9,7 +9,12 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.registry import FILE_READERS
 from hand_eye_calib.core.base.text import shortened
-from hand_eye_calib.formats.files import LONGEST_NAME, decoded, read_bytes, read_text
+from hand_eye_calib.formats.files import (
+    LONGEST_NAME,
+    decoded,
+    read_bytes,
+    read_text,
+)
 from hand_eye_calib.formats.trajectory_files.cells import are_whole
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -19,7 +24,10 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     stamp_columns,
 )
 from hand_eye_calib.formats.trajectory_files.dates import notes_on_stamps
-from hand_eye_calib.formats.trajectory_files.file_options import AUTO, FileOptions
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
 from hand_eye_calib.formats.trajectory_files.layout import (
     DECIMAL_COMMAS,
     TUM,
@@ -86,7 +94,9 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     if layout.row:
         table.fill(lines_of(path, text, layout.rows_after), layout.cells_of)
         stamp_cells = [
-            layout.row[place] for place in table.stamp_at if place < len(layout.row)
+            layout.row[place]
+            for place in table.stamp_at
+            if place < len(layout.row)
         ]
         for note in notes_on_stamps(table.stamp_names, stamp_cells):
             table.guess(note)
@@ -125,13 +135,17 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
     elif format == AUTO:
         # Only the option `times` is set, which is for poses without stamps. Keep a layout without a
         # stamp; any other file must be in the format kitti.
-        if layout.columns and not stamp_columns(named_columns(layout.columns)[0]):
+        if layout.columns and not stamp_columns(
+            named_columns(layout.columns)[0]
+        ):
             return layout
         format = "kitti"
         columns = MATRIX
     elif format != "csv":
         columns = tuple(_FORMATS[format][0])
-    return replace(layout, format=format, columns=columns, is_transposable=False)
+    return replace(
+        layout, format=format, columns=columns, is_transposable=False
+    )
 
 
 def _guesses_of(layout: Layout) -> list[str]:
@@ -158,7 +172,9 @@ def _guesses_of(layout: Layout) -> list[str]:
     return guesses
 
 
-def _empty_table(path: str | Path, layout: Layout, options: FileOptions) -> Table:
+def _empty_table(
+    path: str | Path, layout: Layout, options: FileOptions
+) -> Table:
     """Return a table without rows, whose columns are those of the layout.
 
     Raises
@@ -190,9 +206,7 @@ def _advice_on_columns(row: Sequence[str]) -> str:
             "7 numbers in a line, tum has 8 (t x y z qx qy qz qw): is one missing? Otherwise "
             f"{naming}"
         )
-    return (
-        f"the first line does not name the columns, so their order is unknown; {naming}"
-    )
+    return f"the first line does not name the columns, so their order is unknown; {naming}"
 
 
 def _add_times(table: Table, options: FileOptions) -> None:

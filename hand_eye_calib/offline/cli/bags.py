@@ -112,7 +112,9 @@ def select(
         What each stream measures, such as "poses".
     """
     named = {
-        stream: source_of(wanted[stream]) for stream in STREAMS if stream in wanted
+        stream: source_of(wanted[stream])
+        for stream in STREAMS
+        if stream in wanted
     }
     frames = {stream: getattr(config, f"{stream}_frame") for stream in STREAMS}
     parent, child = bag.select(named.get("parent"), named.get("child"), frames)
@@ -130,7 +132,9 @@ def select(
 
 def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
     """Return the stamps to use for "parent" and "child": "header" or "receive"."""
-    return {stream: wanted.get(f"{stream}_stamps", "header") for stream in STREAMS}
+    return {
+        stream: wanted.get(f"{stream}_stamps", "header") for stream in STREAMS
+    }
 
 
 def read_sources(
@@ -153,7 +157,11 @@ def read_sources(
     trajectories = []
     repairs: list[str] = []
     # Errors name the options of a stream. The sensors of a rig share those options.
-    streams = STREAMS if len(measures) == len(STREAMS) else [STREAMS[0]] * len(measures)
+    streams = (
+        STREAMS
+        if len(measures) == len(STREAMS)
+        else [STREAMS[0]] * len(measures)
+    )
     for stream, (source, kind, stamps) in zip(streams, measures, strict=True):
         with waiting_for(f"reading {source}"):
             trajectory, notes = bag.trajectory(source, kind, stamps, stream)
@@ -170,12 +178,18 @@ def _read_bags(
     with PoseBag(*paths) as bag:
         sources, measures = select(bag, wanted, config)
         refuse_recordings(paths, sources.values())
-        kinds: Options = {f"{stream}_measures": measures[stream] for stream in STREAMS}
+        kinds: Options = {
+            f"{stream}_measures": measures[stream] for stream in STREAMS
+        }
         calibrator = Calibrator(dataclasses.replace(config, **kinds))
         bag.shown = with_progress
         stamps = stamps_of(wanted)
         poses = bag.poses(
-            sources["parent"], sources["child"], config.max_gap, measures, stamps
+            sources["parent"],
+            sources["child"],
+            config.max_gap,
+            measures,
+            stamps,
         )
         _feed(calibrator, poses, sources)
         for stream, source in sources.items():
@@ -183,7 +197,9 @@ def _read_bags(
                 calibrator.set_frame(stream, str(source))
         note(*bag.warnings)
         inputs = {"bag": str(bag), **calibrator.inputs(sources)}
-        return Recording(calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings))
+        return Recording(
+            calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings)
+        )
 
 
 def _feed(
@@ -212,7 +228,9 @@ def _feed(
             raise InputError(f"{at}: {error}") from error
 
 
-def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> None:
+def refuse_recordings(
+    paths: Sequence[Path], sources: Collection[Source]
+) -> None:
     """Raise a SeveralRecordingsError for bags that are not parts of one recording.
 
     Two parts of one recording have different topics, or one part follows the other without a pause.
@@ -224,7 +242,9 @@ def refuse_recordings(paths: Sequence[Path], sources: Collection[Source]) -> Non
     for bag in sorted(_Bag.of(path, sources) for path in paths):
         for recording in recordings:
             with_same_topics = [
-                earlier for earlier in recording if earlier.sources & bag.sources
+                earlier
+                for earlier in recording
+                if earlier.sources & bag.sources
             ]
             difference = bag.difference_from(with_same_topics)
             if not difference:
@@ -268,7 +288,9 @@ class _Bag(NamedTuple):
         reason = f"there is a pause of {pause_s:.0f} s between them"
         if pause_s < 0:
             until_ns = min(latest.end_ns, self.end_ns)
-            reason = f"both cover the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
+            reason = (
+                f"both cover the same {(until_ns - self.begin_ns) * 1e-9:.1f} s"
+            )
         return f"{latest.path} and {self.path} are two recordings, not parts of one: {reason}"
 
 
@@ -282,7 +304,8 @@ def journal_in(path: Path | str) -> Path | None:
     from hand_eye_calib.formats.journal import has_session
 
     return next(
-        (folder for folder in (path, path / "journal") if has_session(folder)), None
+        (folder for folder in (path, path / "journal") if has_session(folder)),
+        None,
     )
 
 
@@ -314,4 +337,6 @@ def read_journal_of(directory: Path, options: Options) -> Recording:
         for stream in STREAMS
     }
     inputs = {"journal": str(directory), **calibrator.inputs(sources)}
-    return Recording(calibrator.snapshot(), inputs, sorted(directory.glob("*.tum")))
+    return Recording(
+        calibrator.snapshot(), inputs, sorted(directory.glob("*.tum"))
+    )

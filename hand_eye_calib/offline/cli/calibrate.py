@@ -12,7 +12,11 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.base.registry import BESIDE_MOTION, ROUTES, SEVERAL_RECORDINGS
+from hand_eye_calib.core.base.registry import (
+    BESIDE_MOTION,
+    ROUTES,
+    SEVERAL_RECORDINGS,
+)
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli import options
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
@@ -80,7 +84,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "node's session, or its output directory",
     )
     add = parser.add_argument
-    listing = "print the bag's topics with types, counts, rates and frames, and exit"
+    listing = (
+        "print the bag's topics with types, counts, rates and frames, and exit"
+    )
     add("--list", action="store_true", help=listing)
     options.add_config_arguments(parser)
     group = parser.add_argument_group("output")
@@ -111,7 +117,9 @@ def _label(text: str) -> tuple[str, str]:
     """Return name and value of a label, from ``NAME=VALUE``."""
     name, sign, value = text.partition("=")
     if not (name and sign and value):
-        raise ConfigError(f"expected NAME=VALUE, such as vehicle=7; got {text!r}")
+        raise ConfigError(
+            f"expected NAME=VALUE, such as vehicle=7; got {text!r}"
+        )
     return name, value
 
 
@@ -155,7 +163,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_locally(arguments, with_urls)
 
 
-def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
+def _run_locally(
+    arguments: argparse.Namespace, with_urls: "RestoreUrls"
+) -> int:
     """Calibrate from local files, and return the exit code.
 
     ``with_urls`` replaces, in plain values, the paths of downloaded copies by their URLs.
@@ -192,7 +202,9 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
                 switched_off(vars(arguments)),
             )
         except bags.SeveralRecordingsError as several:
-            note(f"{several.reason}; they give one result, as recordings of one rig")
+            note(
+                f"{several.reason}; they give one result, as recordings of one rig"
+            )
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(
@@ -200,11 +212,17 @@ def _run_locally(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
     )
     bag = paths[0] if are_bags else None
     return deliver(
-        calibration, with_urls(recording.inputs), arguments, recording.snapshot, bag
+        calibration,
+        with_urls(recording.inputs),
+        arguments,
+        recording.snapshot,
+        bag,
     )
 
 
-def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int:
+def _list_topics(
+    arguments: argparse.Namespace, with_urls: "RestoreUrls"
+) -> int:
     """Print the topics of a bag, and return the exit code.
 
     A row has, among others, the mean rate over the whole bag, whether the topic has poses, and the
@@ -230,7 +248,9 @@ def _list_topics(arguments: argparse.Namespace, with_urls: "RestoreUrls") -> int
         }
     document = with_urls(document)
     note(*document["warnings"])
-    print_result(_table_of_topics(document), document if arguments.json else None)
+    print_result(
+        _table_of_topics(document), document if arguments.json else None
+    )
     return 0
 
 
@@ -245,7 +265,9 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
     for topic in bag.topics.values():
         quantity, frame = measured.get(topic.name, ("", ""))
         rate_hz = (
-            (topic.count - 1) / (bag.duration_s or 1.0) if topic.count > 1 else None
+            (topic.count - 1) / (bag.duration_s or 1.0)
+            if topic.count > 1
+            else None
         )
         rows.append(
             {
@@ -263,7 +285,9 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
 def _table_of_topics(document: "Document") -> list[str]:
     """Return the lines of the table of topics, with advice below."""
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
-    lines.append(_ROW.format("topic", "type", "count", "rate", "poses", "frames"))
+    lines.append(
+        _ROW.format("topic", "type", "count", "rate", "poses", "frames")
+    )
     for row in document["topics"]:
         cells = [
             row["name"],

@@ -44,7 +44,15 @@ most used options:
 
 {_EPILOG}"""
 
-_HEADINGS = ("", "poses", "seconds", "per s", "longest gap", "path length", "rotation")
+_HEADINGS = (
+    "",
+    "poses",
+    "seconds",
+    "per s",
+    "longest gap",
+    "path length",
+    "rotation",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -155,7 +163,8 @@ def _read_streams(
         stamps = bags.stamps_of(wanted)
         names = {stream: str(source) for stream, source in sources.items()}
         readings = [
-            (sources[stream], measures[stream], stamps[stream]) for stream in STREAMS
+            (sources[stream], measures[stream], stamps[stream])
+            for stream in STREAMS
         ]
         return _Streams(names, *bags.read_sources(bag, readings))
 
@@ -169,7 +178,9 @@ def _stream_lines(
     for name, summary in streams.items():
         path = "none" if summary.path_m is None else length(summary.path_m)
         rotation = (
-            "none" if summary.rotation_rad is None else angle(summary.rotation_rad)
+            "none"
+            if summary.rotation_rad is None
+            else angle(summary.rotation_rad)
         )
         yield (
             f"{name:<8} {summary.poses:8d} {summary.duration_s:9.1f} {summary.rate_hz:7.1f} "
@@ -181,15 +192,17 @@ def _verdict(findings: "Sequence[Finding]") -> str:
     """Return the verdict that a calibration would get, and what to do, in one sentence."""
     from hand_eye_calib.core.results.reasons import Verdict
 
-    serious = [finding for finding in findings if finding.severity.value != "note"]
+    serious = [
+        finding for finding in findings if finding.severity.value != "note"
+    ]
     if not serious:
-        return (
-            "No fault found in these streams; calibrate states how good the result is."
-        )
+        return "No fault found in these streams; calibrate states how good the result is."
     errors = [finding for finding in serious if finding.makes_unusable]
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):
-        typed = " ".join(typed_options(finding.options.items()) for finding in serious)
+        typed = " ".join(
+            typed_options(finding.options.items()) for finding in serious
+        )
         return f"{verdict.value} as they are: calibrate with {typed}."
     codes = ", ".join(finding.code for finding in errors or serious)
     return f"{verdict.value}: check these findings first: {codes}."

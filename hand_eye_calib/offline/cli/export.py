@@ -2,7 +2,10 @@
 
 import argparse
 
-from hand_eye_calib.offline.cli.options import RESULT_FORMATS, add_result_argument
+from hand_eye_calib.offline.cli.options import (
+    RESULT_FORMATS,
+    add_result_argument,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

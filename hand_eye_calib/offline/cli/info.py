@@ -18,11 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "  hand_eye_calib info result --as kalibr > camchain-imucam.yaml"
     )
     add_result_argument(parser)
-    formats = (
-        f"print the result as the file of another program: {', '.join(RESULT_FORMATS)}"
-    )
+    formats = f"print the result as the file of another program: {', '.join(RESULT_FORMATS)}"
     parser.add_argument(
-        "--as", dest="format", choices=RESULT_FORMATS, metavar="FORMAT", help=formats
+        "--as",
+        dest="format",
+        choices=RESULT_FORMATS,
+        metavar="FORMAT",
+        help=formats,
     )
     add_json_argument(parser, or_verbose=True)
 

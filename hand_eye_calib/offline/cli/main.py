@@ -26,7 +26,12 @@ from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.core.base.text import listing, shown_value
 from hand_eye_calib.formats.files import limit_memory
-from hand_eye_calib.offline.cli.options import Exit, as_typed, command_with, fail
+from hand_eye_calib.offline.cli.options import (
+    Exit,
+    as_typed,
+    command_with,
+    fail,
+)
 from hand_eye_calib.offline.cli.paths import calibrating, misplaced
 
 _EPILOG = """\
@@ -180,11 +185,11 @@ def _run(argv: Sequence[str]) -> int:
         "--version", action="store_true", help="show the version and exit"
     )
     if command is not None and command not in COMMANDS:
-        known = (
-            f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
-        )
+        known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
         if line := calibrating(argv):
-            parser.error(f"{command!r} is a path; a command comes first: {line}")
+            parser.error(
+                f"{command!r} is a path; a command comes first: {line}"
+            )
         parser.error(f"invalid choice: {command!r}, {known}")
     parsers = _add_commands(parser)
     if command is not None:
@@ -230,7 +235,9 @@ def _description() -> str:
         "",
     ]
     lines.append("commands:")
-    lines += [f"  {name:<12}{command.help}" for name, command in COMMANDS.items()]
+    lines += [
+        f"  {name:<12}{command.help}" for name, command in COMMANDS.items()
+    ]
     return "\n".join(lines)
 
 
@@ -240,7 +247,10 @@ def _add_commands(
     """Add all commands to a parser, and return their parsers by name."""
     # Without ``prog``, argparse would begin the usage of each command with that of the program.
     commands = parser.add_subparsers(
-        dest="command", metavar="COMMAND", prog=parser.prog, help=argparse.SUPPRESS
+        dest="command",
+        metavar="COMMAND",
+        prog=parser.prog,
+        help=argparse.SUPPRESS,
     )
     parsers = {}
     for name in COMMANDS:
@@ -285,7 +295,9 @@ def _commands_with(option: str) -> dict[str, argparse.ArgumentParser]:
     """
     owners: dict[str, argparse.ArgumentParser] = {}
     for name, command in COMMANDS.items():
-        parser: argparse.ArgumentParser = CommandParser(prog=f"hand_eye_calib {name}")
+        parser: argparse.ArgumentParser = CommandParser(
+            prog=f"hand_eye_calib {name}"
+        )
         with suppress(ImportError):
             command.load().add_arguments(parser)
         if option in parser._option_string_actions and option != "-h":

@@ -26,7 +26,11 @@ from hand_eye_calib.core.base.option import (
     check_value,
     did_you_mean,
 )
-from hand_eye_calib.core.base.spelling import Interface, spelled, spelled_options
+from hand_eye_calib.core.base.spelling import (
+    Interface,
+    spelled,
+    spelled_options,
+)
 from hand_eye_calib.core.base.text import quantities
 from hand_eye_calib.formats.files import local_path
 
@@ -37,7 +41,11 @@ OPTION_FIELDS = config.CalibratorConfig.by_name()
 
 # Options of a parameter file that only the node uses, and those that rclpy declares.
 _NODE_OPTIONS = config.NodeConfig.by_name()
-_ROS_OPTIONS = ("use_sim_time", "start_type_description_service", "qos_overrides")
+_ROS_OPTIONS = (
+    "use_sim_time",
+    "start_type_description_service",
+    "qos_overrides",
+)
 # Names of nodes in a parameter file whose section applies to the calibrator.
 _NODES = ("calibrator", "**", "*", "")
 # Key of the parameters of a node in a parameter file.
@@ -47,7 +55,14 @@ _AXES = ", ".join(
 )
 
 # Options that most users set. They are in the first group of the help.
-_COMMON = ("method", "reference", "time_offset", "scale", "parent_frame", "child_frame")
+_COMMON = (
+    "method",
+    "reference",
+    "time_offset",
+    "scale",
+    "parent_frame",
+    "child_frame",
+)
 
 # File formats in which a saved result can be printed.
 RESULT_FORMATS = (*config.ROBOT_FORMATS, *config.EXPORT_FORMATS)
@@ -171,13 +186,17 @@ def note(*texts: object) -> None:
     """Print each text as a note to the user, in one line on stderr."""
     for text in texts:
         print(
-            f"hand_eye_calib: note: {printable(as_typed(str(text)))}", file=sys.stderr
+            f"hand_eye_calib: note: {printable(as_typed(str(text)))}",
+            file=sys.stderr,
         )
 
 
 def fail(error: object, code: int = Exit.FAILED) -> int:
     """Print an error in one line on stderr, and return ``code``."""
-    print(f"hand_eye_calib: error: {printable(as_typed(str(error)))}", file=sys.stderr)
+    print(
+        f"hand_eye_calib: error: {printable(as_typed(str(error)))}",
+        file=sys.stderr,
+    )
     return code
 
 
@@ -258,7 +277,9 @@ def argument_type(
         try:
             return parse(text)
         except ConfigError as error:
-            raise argparse.ArgumentTypeError(str(error).removeprefix(prefix)) from None
+            raise argparse.ArgumentTypeError(
+                str(error).removeprefix(prefix)
+            ) from None
 
     return parsed
 
@@ -284,9 +305,13 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     # Values may begin with a minus, such as -1e-3 and -90deg+/-2deg: they are no options.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
-    rare = parser.add_argument_group("calibration options that are rarely needed")
+    rare = parser.add_argument_group(
+        "calibration options that are rarely needed"
+    )
     rest = [
-        name for name in OPTION_FIELDS if name not in _COMMON and "prior." not in name
+        name
+        for name in OPTION_FIELDS
+        if name not in _COMMON and "prior." not in name
     ]
     for name in (*_COMMON, *rest):
         field = OPTION_FIELDS[name]
@@ -295,14 +320,18 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         if meta["unit"] == "rad":
             unit = " Unit: rad, or typed as in 0.3deg."
         default = "" if field.default == "" else f" Default: {field.default}."
-        value = "|".join([*meta["words"], flag(name).rpartition("-")[2].upper()])
+        value = "|".join(
+            [*meta["words"], flag(name).rpartition("-")[2].upper()]
+        )
         (group if name in _COMMON else rare).add_argument(
             f"--{flag(name)}",
             dest="options",
             action="append",
             default=[],
             type=argument_type(partial(_checked_option, name), f"{name} "),
-            metavar=f"{{{','.join(meta['choices'])}}}" if meta["choices"] else value,
+            metavar=f"{{{','.join(meta['choices'])}}}"
+            if meta["choices"]
+            else value,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
     add = group.add_argument
@@ -351,14 +380,18 @@ def _checked_option(name: str, value: object) -> tuple[str, OptionValue]:
     unit = field.metadata["unit"]
     if isinstance(value, str) and kind in (int, float):
         if unit in ("m", "rad"):
-            return name, check_value(field, *quantities(name, [unit], [value], ""))
+            return name, check_value(
+                field, *quantities(name, [unit], [value], "")
+            )
         # If the text is no number, check_value below reports what is expected.
         with suppress(ValueError):
             value = kind(value)
     checked = check_value(field, value)
     if name.endswith("_frame") and len(str(checked).split()) > 1:
         proposed = "_".join(str(checked).split())
-        note(f"the frame name {checked!r} contains a space; {proposed!r} may be meant")
+        note(
+            f"the frame name {checked!r} contains a space; {proposed!r} may be meant"
+        )
     return name, checked
 
 
@@ -372,7 +405,9 @@ def options_from(arguments: argparse.Namespace) -> Options:
     ConfigError
         If the file has an unknown option or a bad value, or an axis has two priors.
     """
-    priors = [name for name, _ in arguments.options if name.startswith("prior.")]
+    priors = [
+        name for name, _ in arguments.options if name.startswith("prior.")
+    ]
     for name in priors:
         if priors.count(name) > 1:
             axis = name.removeprefix("prior.")
@@ -436,14 +471,19 @@ def _settings_of_file(document: Mapping[str, Any]) -> _Settings:
     other_nodes: dict[str, None] = {}
     for name, value in _flat(document):
         node, is_ros_parameter, option = name.rpartition(f"{_ROS_SECTION}.")
-        if is_ros_parameter and re.split("[./]", node.rstrip("."))[-1] not in _NODES:
+        if (
+            is_ros_parameter
+            and re.split("[./]", node.rstrip("."))[-1] not in _NODES
+        ):
             other_nodes[f"/{node.strip('/.')}"] = None
         else:
             values.append((option, value))
     return _Settings(values, [*other_nodes])
 
 
-def _option_in_file(path: Path, option: str, value: object) -> tuple[str, OptionValue]:
+def _option_in_file(
+    path: Path, option: str, value: object
+) -> tuple[str, OptionValue]:
     """Return the name and the checked value of an option; an error names the file."""
     try:
         return _checked_option(option, value)
@@ -457,11 +497,15 @@ def _unknown_option(path: Path, option: str) -> ConfigError:
     """Return the error about an unknown option in a file of options."""
     # as_typed() does not change names in quotes: they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
-    hint = did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"
+    hint = (
+        did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"
+    )
     return ConfigError(f"{path}: unknown option {option!r}{hint}")
 
 
-def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(
+    mapping: Mapping[str, Any], prefix: str = ""
+) -> Iterator[tuple[str, Any]]:
     """Yield names and values of nested mappings; the keys of a name are joined by dots."""
     for name, value in mapping.items():
         if isinstance(value, dict):
@@ -473,7 +517,9 @@ def _flat(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 # -------------------------------------------------- what is read, what is written
 
 
-def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> None:
+def add_input_arguments(
+    parser: argparse.ArgumentParser, help_of_paths: str
+) -> None:
     """Add the arguments about the input: paths, streams of a bag, and options of files."""
     parser.add_argument(
         "paths", metavar="PATH", nargs="*", type=_path, help=help_of_paths
@@ -494,7 +540,9 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
             "fields of the poses in messages of any type on "
             f"--{stream}-topic: t=header.stamp,x=pose.position.x,..."
         )
-        group.add_argument(f"--{stream}-fields", metavar="NAME=PATH,...", help=fields)
+        group.add_argument(
+            f"--{stream}-fields", metavar="NAME=PATH,...", help=fields
+        )
     help_of_stamps = (
         "origin of the stamps: the header, or the time at which the recorder "
         "received the message. Default: header"
@@ -510,9 +558,13 @@ def add_input_arguments(parser: argparse.ArgumentParser, help_of_paths: str) -> 
     for name, settings in FILE_OPTIONS.items():
         group.add_argument(f"--{flag(name)}", dest=name, **settings)
         for stream in STREAMS:
-            for_stream = settings | {"help": f"the same for {stream.upper()} only"}
+            for_stream = settings | {
+                "help": f"the same for {stream.upper()} only"
+            }
             group.add_argument(
-                f"--{stream}-{flag(name)}", dest=f"{stream}_{name}", **for_stream
+                f"--{stream}-{flag(name)}",
+                dest=f"{stream}_{name}",
+                **for_stream,
             )
     pair_by = (
         "pairing of the poses of both files: time, by their stamps; row, by "

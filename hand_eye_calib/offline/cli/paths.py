@@ -15,7 +15,9 @@ from hand_eye_calib.formats.files import open_regular
 from hand_eye_calib.offline.cli.options import argument_type
 
 # Line that only the file of a result has.
-_LINE_OF_RESULT = re.compile(rb"^format: hand_eye_calib/extrinsic\s*$", re.MULTILINE)
+_LINE_OF_RESULT = re.compile(
+    rb"^format: hand_eye_calib/extrinsic\s*$", re.MULTILINE
+)
 # The line is among the first bytes of the file.
 _BEGINNING = 4096
 
@@ -45,7 +47,11 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
                 f"{path} is a saved result: show it with hand_eye_calib info "
                 f"{shlex.quote(str(path))}, or pass the streams again"
             )
-    if command == "replay" and len(paths) > 1 and all(map(is_plain_file, paths)):
+    if (
+        command == "replay"
+        and len(paths) > 1
+        and all(map(is_plain_file, paths))
+    ):
         raise ConfigError(
             "replay is for bags and journals; for trajectory files: hand_eye_calib "
             f"calibrate {shlex.join(map(str, paths))}"

@@ -12,7 +12,11 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.spelling import PLACEHOLDER, Interface
 from hand_eye_calib.core.base.text import frame_name, listing, with_sigma
 from hand_eye_calib.core.checks.findings import LIMITS
-from hand_eye_calib.core.results.calibration import Calibration, DofVerdict, Verdict
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    DofVerdict,
+    Verdict,
+)
 from hand_eye_calib.core.results.document import (
     allowance_in_words,
     angles_in_words,
@@ -77,17 +81,25 @@ def deliver(
     pictures : sequence of callable
         Functions that draw further figures of the report from the calibration.
     """
-    if (arguments.installed or arguments.base_frame) and not calibration.status.failure:
+    if (
+        arguments.installed or arguments.base_frame
+    ) and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
-    written = _saved(calibration, arguments.out, inputs) if arguments.out else ""
-    steps = () if arguments.json else next_steps(calibration, arguments, snapshot)
+    written = (
+        _saved(calibration, arguments.out, inputs) if arguments.out else ""
+    )
+    steps = (
+        () if arguments.json else next_steps(calibration, arguments, snapshot)
+    )
     is_scale_free = snapshot is not None and snapshot.config.scale in (
         "estimate",
         "auto",
     )
-    document = calibration.to_dict() | {"inputs": inputs} if arguments.json else None
+    document = (
+        calibration.to_dict() | {"inputs": inputs} if arguments.json else None
+    )
     try:
         lines = as_lines(calibration, steps, arguments.verbose, is_scale_free)
         print_result(lines, document)
@@ -111,7 +123,9 @@ def _saved(calibration: Calibration, directory: Path, inputs: Document) -> str:
     kept = results.keep_earlier_results(directory)
     path = results.save_result(calibration, directory, inputs)
     names = [results.XACRO_NAME, results.LAUNCH_NAME]
-    names += [file for name in calibration.parts for file in part(name).file_names]
+    names += [
+        file for name in calibration.parts for file in part(name).file_names
+    ]
     beside = [name for name in names if path.with_name(name).exists()]
     for_robots = f", {listing(beside)}" if beside else ""
     return f"wrote {path}{for_robots}{kept}"
@@ -161,8 +175,12 @@ def end(calibrations: Sequence[Calibration]) -> int:
     for calibration in calibrations:
         if calibration.has_failed:
             reason = calibration.reasons[0]
-            sensor = f"{calibration.child_frame}: " if len(calibrations) > 1 else ""
-            fail(f"{sensor}{reason.sentence}; do not use this result, {reason.advice}")
+            sensor = (
+                f"{calibration.child_frame}: " if len(calibrations) > 1 else ""
+            )
+            fail(
+                f"{sensor}{reason.sentence}; do not use this result, {reason.advice}"
+            )
     return gravest_code(map(exit_code, calibrations))
 
 
@@ -194,7 +212,10 @@ def as_lines(
     installed extrinsic. ``with_details`` adds quaternions and facts about the solution.
     ``is_scale_free`` says that the user had the scale estimated.
     """
-    lines = [*verdict_lines(calibration), *_extrinsic_lines(calibration, with_details)]
+    lines = [
+        *verdict_lines(calibration),
+        *_extrinsic_lines(calibration, with_details),
+    ]
     lines += _clock_and_scale_lines(calibration, is_scale_free)
     if steps:
         lines += ["Next", *(f"  {step}" for step in steps)]
@@ -207,7 +228,9 @@ def as_lines(
             f"compared with the installed transform ({comparison.installed}): {comparison.sentence}"
         )
     if with_details:
-        details += [f"{name}: {value}" for name, value in summary(calibration).items()]
+        details += [
+            f"{name}: {value}" for name, value in summary(calibration).items()
+        ]
         details += facts_of(calibration)
     if details:
         lines.append("Details")
@@ -227,8 +250,13 @@ def publish_lines(calibration: Calibration) -> list[str]:
         for number in usable_numbers(calibration).values()
         if isinstance(number, str)
     ]
-    condition = f", after you have replaced {listing(by_hand)}" if by_hand else ""
-    return [f"To publish it ({calibration.verdict.value}{condition})", f"  {command}"]
+    condition = (
+        f", after you have replaced {listing(by_hand)}" if by_hand else ""
+    )
+    return [
+        f"To publish it ({calibration.verdict.value}{condition})",
+        f"  {command}",
+    ]
 
 
 def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
@@ -242,7 +270,8 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
     }
     extra = extra_transforms(calibration)
     frames |= {
-        name: (transform.source, transform.target) for name, transform in extra.items()
+        name: (transform.source, transform.target)
+        for name, transform in extra.items()
     }
     transforms = transforms_of(calibration)
     lines = []
@@ -256,7 +285,9 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
             f"{source} in {target}: maps coordinates of {source} into {target}"
         )
         if name == "T_parent_child" or with_details:
-            lines += transform_lines(transforms[name], out_of_reach, with_details)
+            lines += transform_lines(
+                transforms[name], out_of_reach, with_details
+            )
         else:
             lines += compact_lines(transforms[name], out_of_reach)
         if words := angles_in_words(transforms[name], calibration):
@@ -266,7 +297,9 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
     return lines
 
 
-def _clock_and_scale_lines(calibration: Calibration, is_scale_free: bool) -> list[str]:
+def _clock_and_scale_lines(
+    calibration: Calibration, is_scale_free: bool
+) -> list[str]:
     """Return the estimated time offset and the scale, which users of the child's data need.
 
     A scale near 1 is left out unless the user had it estimated.
@@ -291,7 +324,9 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
         # If the headline contains the sentence of the first reason, only the advice follows.
         if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
-        yield from wrapped(reason.advice_on(Interface.TERMINAL), "  -> ", "     ")
+        yield from wrapped(
+            reason.advice_on(Interface.TERMINAL), "  -> ", "     "
+        )
     for warning in calibration.warnings:
         yield from wrapped(f"Note: {warning}", "", "  ")
 
@@ -309,7 +344,9 @@ def wrapped(text: str, first: str, others: str) -> list[str]:
 
 
 def next_steps(
-    calibration: Calibration, arguments: argparse.Namespace, snapshot: "Snapshot | None"
+    calibration: Calibration,
+    arguments: argparse.Namespace,
+    snapshot: "Snapshot | None",
 ) -> list[str]:
     """Return sentences and commands that improve the result; empty if the verdict is USE."""
     if calibration.verdict is Verdict.USE:
@@ -318,13 +355,17 @@ def next_steps(
     for reason in shown(calibration.reasons):
         options |= reason.options
     # A command with a value that is still to be measured would not run.
-    options = {name: value for name, value in options.items() if value != PLACEHOLDER}
+    options = {
+        name: value for name, value in options.items() if value != PLACEHOLDER
+    }
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
         if motion := _missing_motion(calibration, snapshot):
             steps.append(motion)
         if axes := calibration.hidden:
-            priors = typed_options((f"prior.{axis}", PLACEHOLDER) for axis in axes)
+            priors = typed_options(
+                (f"prior.{axis}", PLACEHOLDER) for axis in axes
+            )
             steps.append(
                 f"measure {listing(axes)} by hand, then add {priors} with your values"
             )
@@ -337,12 +378,19 @@ def next_steps(
     return steps
 
 
-def _missing_motion(calibration: Calibration, snapshot: "Snapshot | None") -> str:
+def _missing_motion(
+    calibration: Calibration, snapshot: "Snapshot | None"
+) -> str:
     """Return the motion that would improve an axis; empty if there is none."""
-    is_improvable = any(dof.verdict in _IMPROVABLE for dof in calibration.observability)
+    is_improvable = any(
+        dof.verdict in _IMPROVABLE for dof in calibration.observability
+    )
     if not is_improvable or snapshot is None or calibration.measured != "poses":
         return ""
-    from hand_eye_calib.core.assessment.excitation import excitation, what_is_missing
+    from hand_eye_calib.core.assessment.excitation import (
+        excitation,
+        what_is_missing,
+    )
 
     return what_is_missing(excitation(snapshot.pose_pairs), calibration)
 
@@ -371,7 +419,9 @@ def transform_lines(
         quaternion = "unknown"
         if transform.quat_xyzw is not None:
             coefficients = zip("xyzw", transform.quat_xyzw, strict=True)
-            quaternion = " ".join(f"{name} {value:.6f}" for name, value in coefficients)
+            quaternion = " ".join(
+                f"{name} {value:.6f}" for name, value in coefficients
+            )
         yield f"  quaternion {quaternion}"
 
 
@@ -386,7 +436,9 @@ def compact_lines(
         yield f"  {translation:<30}  {rotation}".rstrip()
 
 
-def _column(numbers: Mapping[str, str], axes: Sequence[str], width: int) -> list[str]:
+def _column(
+    numbers: Mapping[str, str], axes: Sequence[str], width: int
+) -> list[str]:
     """Return the column of three axes; a text about all three axes is in the second row."""
     if text := numbers.get(listing(axes)):
         return ["", f"{listing(axes)} are {text}", ""]

@@ -101,11 +101,15 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     refuse_repeated_paths(paths)
     urls = [path for path in paths if isinstance(path, str)]
     local_bags = [
-        path for path in paths if isinstance(path, Path) and _looks_like_bag(path)
+        path
+        for path in paths
+        if isinstance(path, Path) and _looks_like_bag(path)
     ]
     n_bags = len(urls) + len(local_bags)
     # A single path that does not exist is opened as a bag, which reports the error.
-    if n_bags == len(paths) or (len(paths) == 1 and not Path(paths[0]).is_file()):
+    if n_bags == len(paths) or (
+        len(paths) == 1 and not Path(paths[0]).is_file()
+    ):
         return True
     if n_bags:
         _refuse_folders_without_bag(local_bags)
@@ -124,13 +128,17 @@ def refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
     """Raise a ConfigError if a path appears twice."""
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
-            raise ConfigError(f"{path} appears twice: pass the file of each sensor")
+            raise ConfigError(
+                f"{path} appears twice: pass the file of each sensor"
+            )
 
 
 def _refuse_folders_without_bag(folders: Sequence[Path]) -> None:
     """Raise a ConfigError if a folder contains no file of a bag."""
     for folder in folders:
-        if folder.is_dir() and not any(map(has_suffix_of_bag, folder.iterdir())):
+        if folder.is_dir() and not any(
+            map(has_suffix_of_bag, folder.iterdir())
+        ):
             raise ConfigError(
                 f"{folder} is a folder without a bag: pass a trajectory file of each sensor, or a "
                 "bag"
@@ -139,7 +147,11 @@ def _refuse_folders_without_bag(folders: Sequence[Path]) -> None:
 
 def is_plain_file(path: Path | str) -> bool:
     """Return whether a path is an existing file that does not have the name of a bag."""
-    return isinstance(path, Path) and path.is_file() and not has_suffix_of_bag(path)
+    return (
+        isinstance(path, Path)
+        and path.is_file()
+        and not has_suffix_of_bag(path)
+    )
 
 
 def _looks_like_bag(path: Path) -> bool:
@@ -164,7 +176,9 @@ def read_pair(arguments: Namespace, options: Options) -> Recording:
             "first_stamp_ns": int(poses.stamps_ns[0]),
             "last_stamp_ns": int(poses.stamps_ns[-1]),
         }
-    times = {arguments.times, arguments.parent_times, arguments.child_times} - {None}
+    times = {arguments.times, arguments.parent_times, arguments.child_times} - {
+        None
+    }
     paths = [*map(Path, arguments.paths), *times]
     parent, child = files.trajectories
     snapshot = whole_snapshot(parent, child, options)
@@ -199,7 +213,9 @@ def read_files(
     streams : sequence of str
         Stream of each path, if there are at most two.
     """
-    from hand_eye_calib.formats.trajectory_files.reading import read_trajectory_files
+    from hand_eye_calib.formats.trajectory_files.reading import (
+        read_trajectory_files,
+    )
 
     streams = streams[: len(paths)] if len(paths) < 3 else [""] * len(paths)
     if len(paths) > 2:
@@ -211,16 +227,26 @@ def read_files(
         with waiting_for(f"reading {' and '.join(map(str, paths))}"):
             readings = read_trajectory_files(files)
     except InputError as error:
-        raise type(error)(_with_option_of_file(str(error), paths, streams)) from None
+        raise type(error)(
+            _with_option_of_file(str(error), paths, streams)
+        ) from None
     repairs: list[str] = []
     warnings: list[str] = []
-    for (path, _), reading, stream in zip(files, readings, streams, strict=True):
-        repairs += [text.replace(str(path), path.name) for text in reading.repairs]
-        warnings += [text.replace(str(path), path.name) for text in reading.warnings]
+    for (path, _), reading, stream in zip(
+        files, readings, streams, strict=True
+    ):
+        repairs += [
+            text.replace(str(path), path.name) for text in reading.repairs
+        ]
+        warnings += [
+            text.replace(str(path), path.name) for text in reading.warnings
+        ]
         for text in reading.guesses:
             text = _with_option_of_file(text, [path], [stream])
             note(text.replace(str(path), path.name))
-    return FilesRead([reading.trajectory for reading in readings], repairs, warnings)
+    return FilesRead(
+        [reading.trajectory for reading in readings], repairs, warnings
+    )
 
 
 def _with_option_of_file(
@@ -232,7 +258,9 @@ def _with_option_of_file(
     """
     for path, stream in zip(paths, streams, strict=True):
         if stream and text.startswith(str(path)):
-            return re.sub(f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text)
+            return re.sub(
+                f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text
+            )
     return text
 
 
@@ -253,7 +281,9 @@ def _options_of_file(
 
     settings: dict[str, Any] = {"format": "auto"}
     for name in (*FILE_OPTIONS, "pair_by"):
-        value = getattr(arguments, f"{stream}_{name}", None) or getattr(arguments, name)
+        value = getattr(arguments, f"{stream}_{name}", None) or getattr(
+            arguments, name
+        )
         if value:
             settings[name] = value
     measures = options.get(f"{stream}_measures", "auto")

@@ -44,7 +44,8 @@ def write_report(
     from hand_eye_calib.offline.report.report import render
 
     write_page(
-        directory, lambda: render(calibration, snapshot, inputs, interface, pictures)
+        directory,
+        lambda: render(calibration, snapshot, inputs, interface, pictures),
     )
 
 

@@ -68,7 +68,9 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
     poses = coarse(trajectory, max(_MIN_PATH_STEP_S, median(intervals_s))).poses
     steps = np.linalg.norm(np.diff(se3.translation_of(poses), axis=0), axis=1)
     rotations = se3.rotation_of(poses)
-    angles = se3.rotation_angle(se3.relative_rotations(rotations[:-1], rotations[1:]))
+    angles = se3.rotation_angle(
+        se3.relative_rotations(rotations[:-1], rotations[1:])
+    )
     # The columns of other kinds, such as the angles of wheels, are no orientations.
     measures_rotation = trajectory.measures in _WITH_ROTATION
     return StreamSummary(
@@ -107,7 +109,9 @@ class StreamView:
         (times_s, parent_rates), (child_times_s, child_rates) = self.rates
         if not len(child_times_s):
             return float("nan")
-        is_shared = (times_s >= child_times_s[0]) & (times_s <= child_times_s[-1])
+        is_shared = (times_s >= child_times_s[0]) & (
+            times_s <= child_times_s[-1]
+        )
         differences = np.abs(
             parent_rates - np.interp(times_s, child_times_s, child_rates)
         )
@@ -198,7 +202,9 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     )
 
 
-def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> StreamView:
+def view_streams(
+    parent: Trajectory, child: Trajectory, max_gap_s: float
+) -> StreamView:
     """Return the rates of two trajectories that are on one clock and in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
     longest_s = max(parent.duration_s, child.duration_s)
@@ -215,11 +221,17 @@ def view_streams(parent: Trajectory, child: Trajectory, max_gap_s: float) -> Str
         rates.append((first_s + np.arange(len(values)) * step_s, values))
         # Each gap ends a span and begins the next one. So the sorted edges are pairs of start and
         # end.
-        gaps = np.flatnonzero(are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s))
-        edges_ns = stream.stamps_ns[np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])]
+        gaps = np.flatnonzero(
+            are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s)
+        )
+        edges_ns = stream.stamps_ns[
+            np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])
+        ]
         spans_s.append((edges_ns.reshape(-1, 2) - start_ns) * 1e-9)
     quantity = "angular rate" if has_rates else "speed"
-    return StreamView(quantity=quantity, rates=tuple(rates), spans_s=tuple(spans_s))
+    return StreamView(
+        quantity=quantity, rates=tuple(rates), spans_s=tuple(spans_s)
+    )
 
 
 def _paths_of_positions(
@@ -240,7 +252,9 @@ def _paths_of_positions(
         T_oriented_point = calibration.T_parent_child
         positions = se3.translation_of(pose_pairs.Ts_cw_c)
     measured = positions - positions[0]
-    computed = moved_onto(measured, se3.translation_of(poses @ T_oriented_point))
+    computed = moved_onto(
+        measured, se3.translation_of(poses @ T_oriented_point)
+    )
     return measured, computed, moved_onto(measured, se3.translation_of(poses))
 
 
@@ -297,7 +311,9 @@ def _angles(
     return measured_rad, measured_rad + errors_rad
 
 
-def turning_part(path: FloatArray, times_s: FloatArray, least_s: float) -> slice:
+def turning_part(
+    path: FloatArray, times_s: FloatArray, least_s: float
+) -> slice:
     """Return the part of a path (N, 3) in which the sensor turns most.
 
     It is the part with the largest ratio of its length to the distance of its ends, among parts
@@ -312,12 +328,16 @@ def turning_part(path: FloatArray, times_s: FloatArray, least_s: float) -> slice
     ends = ends[starts]
     # Steps between poses that are apart sum the motion, not the noise.
     stride = max(1, round(_MIN_PATH_STEP_S / median(np.diff(times_s))))
-    way = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(path[::stride], axis=0), axis=1))]
+    way = np.r_[
+        0.0, np.cumsum(np.linalg.norm(np.diff(path[::stride], axis=0), axis=1))
+    ]
     travelled = np.interp(times_s, times_s[::stride], way)
     lengths = travelled[ends] - travelled[starts]
     chords = np.linalg.norm(path[ends] - path[starts], axis=1)
     is_long = 2 * lengths >= median(lengths)
-    row = int(np.argmax(np.where(is_long, lengths / (chords + 0.1 * lengths), 0.0)))
+    row = int(
+        np.argmax(np.where(is_long, lengths / (chords + 0.1 * lengths), 0.0))
+    )
     return slice(int(starts[row]), int(ends[row]) + 1)
 
 
@@ -342,7 +362,9 @@ def upward_normal(poses: FloatArray) -> FloatArray | None:
     return np.asarray(np.copysign(1.0, cosine) * normal)
 
 
-def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+def spread_of_position(
+    calibration: Calibration,
+) -> tuple[FloatArray, FloatArray]:
     """Return covariance and unknown directions of the child's position, in the parent's axes.
 
     Returns
@@ -362,5 +384,9 @@ def spread_of_position(calibration: Calibration) -> tuple[FloatArray, FloatArray
         is_huge = (variances > UNKNOWN_M**2) & is_unknown.any()
         if is_huge.any() or not is_unknown.any():
             finite = directions[:, ~is_huge]
-            return (finite * variances[~is_huge]) @ finite.T, directions[:, is_huge].T
-    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[is_unknown]
+            return (finite * variances[~is_huge]) @ finite.T, directions[
+                :, is_huge
+            ].T
+    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[
+        is_unknown
+    ]

@@ -34,11 +34,18 @@ from hand_eye_calib.offline.report.style import (
     page_style,
     plain_label,
 )
-from hand_eye_calib.offline.report.views import VIEWS, VIEWS_OF_VEHICLE, figure_of_views
+from hand_eye_calib.offline.report.views import (
+    VIEWS,
+    VIEWS_OF_VEHICLE,
+    figure_of_views,
+)
 
 # Factor from SI units to the unit of a figure, and label of its axis, for translations ("x") and
 # rotations ("yaw").
-UNITS = {"x": (100.0, "translation (cm)"), "yaw": (180 / np.pi, "rotation (deg)")}
+UNITS = {
+    "x": (100.0, "translation (cm)"),
+    "yaw": (180 / np.pi, "rotation (deg)"),
+}
 
 # Why the rates of both streams must coincide, by the quantity that is drawn.
 _WHY_EQUAL = {
@@ -58,7 +65,9 @@ class _Curve(NamedTuple):
     name: str
 
 
-def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Drawn]:
+def figures_of(
+    calibration: Calibration, evidence: Evidence | None
+) -> list[Drawn]:
     """Draw all figures of a result; ``evidence`` is None for the stops of an arm."""
     figures = []
     titles = _titles_of_views(evidence)
@@ -69,7 +78,9 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
         figures.append(figure_of_views([calibration], titles))
         if evidence and evidence.without_lever_arm is not None:
             figures.append(
-                _figure_of_track(calibration, evidence, evidence.without_lever_arm)
+                _figure_of_track(
+                    calibration, evidence, evidence.without_lever_arm
+                )
             )
         if evidence:
             figures.append(_figure_of_paths(calibration, evidence))
@@ -79,10 +90,14 @@ def figures_of(calibration: Calibration, evidence: Evidence | None) -> list[Draw
         figures.append(_figure_of_coordinates(calibration, evidence))
     if evidence and evidence.without_lever_arm is not None:
         figures.append(
-            _figure_of_positions(calibration, evidence, evidence.without_lever_arm)
+            _figure_of_positions(
+                calibration, evidence, evidence.without_lever_arm
+            )
         )
     if calibration.motion_residuals:
-        figures.append(_figure_of_residuals(calibration, calibration.motion_residuals))
+        figures.append(
+            _figure_of_residuals(calibration, calibration.motion_residuals)
+        )
     if evidence:
         names = (calibration.parent_frame, calibration.child_frame)
         figures.append(figure_of_streams(evidence.streams, names))
@@ -118,10 +133,16 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
         directed = np.stack([points, ends], axis=1).T
         panel.plot(*directed, color=MUTED, lw=0.7)
         panel.plot(
-            *points[is_used].T, "o", color=CHILD, ms=3.5, label=plain_label(child)
+            *points[is_used].T,
+            "o",
+            color=CHILD,
+            ms=3.5,
+            label=plain_label(child),
         )
         if not is_used.all():
-            panel.plot(*points[~is_used].T, "x", color=BAD, ms=5.5, label="left out")
+            panel.plot(
+                *points[~is_used].T, "x", color=BAD, ms=5.5, label="left out"
+            )
         panel.plot(0.0, 0.0, "s", color=PARENT, ms=6, label=plain_label(world))
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)")
         panel.set_aspect("equal", adjustable="datalim")
@@ -142,21 +163,31 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
     is_speed = view.quantity == "speed"
     ends_s = [times_s[-1] for times_s, _ in view.rates if len(times_s)]
     factor, unit = _time_axis(max(ends_s, default=0.0))
-    figure, (curves, strip) = make_panels(3.0, 2, 1, sharex=True, height_ratios=(5, 1))
+    figure, (curves, strip) = make_panels(
+        3.0, 2, 1, sharex=True, height_ratios=(5, 1)
+    )
     looks = ((PARENT, 2.6), (CHILD, 1.0))
     streams = zip(view.rates, view.spans_s, names, looks, strict=True)
-    for row, ((times_s, rates), spans_s, name, (colour, width)) in enumerate(streams):
+    for row, ((times_s, rates), spans_s, name, (colour, width)) in enumerate(
+        streams
+    ):
         values = rates if is_speed else np.degrees(rates)
         curves.plot(
-            times_s * factor, values, color=colour, lw=width, label=plain_label(name)
+            times_s * factor,
+            values,
+            color=colour,
+            lw=width,
+            label=plain_label(name),
         )
         # A bar has its start and its length.
         bars = [
-            (start_s * factor, (end_s - start_s) * factor) for start_s, end_s in spans_s
+            (start_s * factor, (end_s - start_s) * factor)
+            for start_s, end_s in spans_s
         ]
         strip.broken_barh(bars, (0.6 - row, 0.8), color=colour, lw=0)
     curves.set(
-        ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)", ylim=(0, None)
+        ylabel="speed (m/s)" if is_speed else "angular rate (deg/s)",
+        ylim=(0, None),
     )
     strip.set(ylim=(-0.6, 1.6), xlabel=f"time ({unit})")
     strip.set_yticks([1.0, 0.0], ["parent", "child"])
@@ -164,14 +195,20 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
     strip.grid(visible=False)
     comparison = "Here the streams never overlap."
     if np.isfinite(view.difference):
-        difference = length(view.difference) if is_speed else angle(view.difference)
-        comparison = f"Here they differ by less than {difference}/s half of the time."
+        difference = (
+            length(view.difference) if is_speed else angle(view.difference)
+        )
+        comparison = (
+            f"Here they differ by less than {difference}/s half of the time."
+        )
     caption = (
         f"{_WHY_EQUAL[view.quantity]} {comparison} The bars below the curves show when there is "
         "data."
     )
     lines, _ = curves.get_legend_handles_labels()
-    return as_drawn(figure, "streams", "Both streams before any solve", caption, lines)
+    return as_drawn(
+        figure, "streams", "Both streams before any solve", caption, lines
+    )
 
 
 @page_style()
@@ -187,7 +224,10 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     child = calibration.child_frame
     # One sensor has measured its path. The path of the same sensor is also computed from the poses
     # of the other sensor and the result.
-    if calibration.measured == "positions" and not evidence.has_positions_of_parent:
+    if (
+        calibration.measured == "positions"
+        and not evidence.has_positions_of_parent
+    ):
         own, other = child, parent
         labels = (f"{parent}, through the result", child)
     else:
@@ -198,7 +238,10 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
         points = path[rows]
         look: Document = {"color": colour, "lw": width}
         plane.plot(
-            points[:, first], points[:, second], label=plain_label(label), **look
+            points[:, first],
+            points[:, second],
+            label=plain_label(label),
+            **look,
         )
         side.plot(evidence.times_s[rows] * factor, points[:, across], **look)
     plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6)
@@ -206,7 +249,10 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     is_level = across == 2
     plane.set(title="From above" if is_level else "In the plane of motion")
     plane.set(
-        xlabel=axes[first], ylabel=axes[second], aspect="equal", adjustable="datalim"
+        xlabel=axes[first],
+        ylabel=axes[second],
+        aspect="equal",
+        adjustable="datalim",
     )
     side.set(title="Height" if is_level else "Across the plane of motion")
     side.set(xlabel=f"time ({unit})", ylabel=axes[across])
@@ -246,7 +292,9 @@ def _figure_of_columns(
         for curve in curves:
             values = curve.columns[rows, column]
             name = plain_label(curve.name)
-            panel.plot(times, values, color=curve.colour, lw=curve.width, label=name)
+            panel.plot(
+                times, values, color=curve.colour, lw=curve.width, label=name
+            )
         panel.set_ylabel(label, labelpad=2)
     for panel in panels[-2:]:
         panel.set_xlabel(f"time ({unit})")
@@ -255,7 +303,9 @@ def _figure_of_columns(
 
 
 @page_style()
-def _figure_of_coordinates(calibration: Calibration, evidence: Evidence) -> Drawn:
+def _figure_of_coordinates(
+    calibration: Calibration, evidence: Evidence
+) -> Drawn:
     """Draw position and turned angles of the parent over time, from both streams."""
     assert evidence.angles is not None
     measured = np.hstack([evidence.parent, np.degrees(evidence.angles[0])])
@@ -323,8 +373,16 @@ def _figure_of_track(
     if evidence.has_positions_of_parent:
         colours = (PARENT, CHILD)
     paths = (
-        (moved_onto(turn, without_lever_arm[part]), MUTED, f"{other}, no lever arm"),
-        (moved_onto(turn, computed[part]), colours[1], f"{other}, through the result"),
+        (
+            moved_onto(turn, without_lever_arm[part]),
+            MUTED,
+            f"{other}, no lever arm",
+        ),
+        (
+            moved_onto(turn, computed[part]),
+            colours[1],
+            f"{other}, through the result",
+        ),
     )
     factor, unit = _time_axis(evidence.times_s[-1])
     times = evidence.times_s[part] * factor
@@ -334,7 +392,10 @@ def _figure_of_track(
     distances = []
     for path, colour, label in paths:
         plane.plot(
-            path[:, first], path[:, second], color=colour, label=plain_label(label)
+            path[:, first],
+            path[:, second],
+            color=colour,
+            label=plain_label(label),
         )
         distances_m = np.linalg.norm(path - turn, axis=1)
         distances.append(length(float(np.median(distances_m))))
@@ -377,7 +438,9 @@ def _figure_of_positions(
     before = without_lever_arm - measured
     after = computed - measured
     nothing = np.full_like(measured, np.nan)
-    labels = [f"{axis} ({unit})" for unit in ("m", "difference, m") for axis in "xyz"]
+    labels = [
+        f"{axis} ({unit})" for unit in ("m", "difference, m") for axis in "xyz"
+    ]
     curves = (
         _Curve(np.hstack([measured, nothing]), PARENT, 1.6, "measured"),
         _Curve(np.hstack([nothing, before]), MUTED, 1.0, "without lever arm"),
@@ -396,7 +459,9 @@ def _figure_of_positions(
 
 
 @page_style()
-def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Drawn:
+def _figure_of_residuals(
+    calibration: Calibration, residuals: Residuals
+) -> Drawn:
     """Draw the sizes of the residuals of a result, translations above rotations."""
     # The keys are those of UNITS. Without positions or orientations, there is only one kind.
     sizes = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
@@ -418,18 +483,28 @@ def _figure_of_residuals(calibration: Calibration, residuals: Residuals) -> Draw
         factor, unit = _time_axis(float(times_s.max()))
         times = times_s * factor
         label = f"time ({unit})"
-    figure, panels = make_panels(0.9 + 1.6 * len(sizes), len(sizes), 1, sharex=True)
+    figure, panels = make_panels(
+        0.9 + 1.6 * len(sizes), len(sizes), 1, sharex=True
+    )
     for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
         to_unit, unit_label = UNITS[axis]
         # A logarithmic axis needs positive values.
-        _draw_residuals(panel, times, np.maximum(values * to_unit, 1e-5), is_out)
+        _draw_residuals(
+            panel, times, np.maximum(values * to_unit, 1e-5), is_out
+        )
         panel.set_ylabel(unit_label)
     panels[-1].set_xlabel(label)
     lines, _ = panels[0].get_legend_handles_labels()
-    medians = [amount(axis, float(np.median(values))) for axis, values in sizes.items()]
-    largest = [amount(axis, float(np.max(values))) for axis, values in sizes.items()]
+    medians = [
+        amount(axis, float(np.median(values))) for axis, values in sizes.items()
+    ]
+    largest = [
+        amount(axis, float(np.max(values))) for axis, values in sizes.items()
+    ]
     rejected = (
-        f"{is_out.sum():,} ({share(float(is_out.mean()))})" if is_out.any() else "None"
+        f"{is_out.sum():,} ({share(float(is_out.mean()))})"
+        if is_out.any()
+        else "None"
     )
     caption = (
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
@@ -452,8 +527,12 @@ def _draw_residuals(
     used = (times[dots], values[dots], "o")
     rejected = (times[crosses], values[crosses], "x")
     panel.plot(*used, color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
-    panel.plot(*rejected, color=BAD, ms=5.5, mew=1.5, label="rejected as outlier")
-    panel.axhline(np.median(values), color=INK, lw=1.0, ls="--", label="median of all")
+    panel.plot(
+        *rejected, color=BAD, ms=5.5, mew=1.5, label="rejected as outlier"
+    )
+    panel.axhline(
+        np.median(values), color=INK, lw=1.0, ls="--", label="median of all"
+    )
     panel.yaxis.set_label_coords(-0.06, 0.5)
     # On a linear axis, a very large residual would hide all others.
     if values.max() > 15 * np.median(values):

@@ -16,7 +16,11 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import REPORT_PICTURES
-from hand_eye_calib.core.base.spelling import Interface, spelled, spelled_options
+from hand_eye_calib.core.base.spelling import (
+    Interface,
+    spelled,
+    spelled_options,
+)
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
@@ -79,10 +83,17 @@ _TEMPLATES = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
-_TEMPLATES.filters |= {"number": text.fixed, "printable": printable, "spelled": spelled}
+_TEMPLATES.filters |= {
+    "number": text.fixed,
+    "printable": printable,
+    "spelled": spelled,
+}
 _TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
 _TEMPLATES.globals |= dict(
-    amount=text.amount, change=text.change, counted=text.counted, capital=text.capital
+    amount=text.amount,
+    change=text.change,
+    counted=text.counted,
+    capital=text.capital,
 )
 _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
@@ -153,13 +164,19 @@ def render(
     command = calibration.static_transform_command()
     calibration = replace(
         calibration,
-        parent_frame=_sensor_name(calibration.parent_frame, inputs.get("parent", {})),
-        child_frame=_sensor_name(calibration.child_frame, inputs.get("child", {})),
+        parent_frame=_sensor_name(
+            calibration.parent_frame, inputs.get("parent", {})
+        ),
+        child_frame=_sensor_name(
+            calibration.child_frame, inputs.get("child", {})
+        ),
     )
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
     evidence = gather(calibration, snapshot) if snapshot else None
-    parent_is_positions = evidence is not None and evidence.has_positions_of_parent
+    parent_is_positions = (
+        evidence is not None and evidence.has_positions_of_parent
+    )
     return page(
         _FOLDER / "report.html",
         TONES[calibration.verdict.value],
@@ -301,7 +318,9 @@ def _at_distance(calibration: Calibration) -> str:
     for point in distance_m * np.eye(3):
         # Derivative of the object's position with respect to the error of the pose.
         J = np.hstack([np.eye(3), -se3.skew(point)])
-        variances.append(np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1])
+        variances.append(
+            np.linalg.eigvalsh(J @ calibration.covariance @ J.T)[-1]
+        )
     child = printable(calibration.child_frame)
     return (
         f"The position of an object {distance_m:g} m from {child} has a standard deviation of "
@@ -351,7 +370,9 @@ def _axes(calibration: Calibration) -> Iterable[AxisRow]:
     """Yield the rows of the table of uncertainties, along and about the parent's axes."""
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
     sigmas_measured = calibration.sigmas_measured.tolist()
-    for dof, measured in zip(calibration.observability, sigmas_measured, strict=True):
+    for dof, measured in zip(
+        calibration.observability, sigmas_measured, strict=True
+    ):
         if dof.name not in calibration.out_of_reach:
             target = target_of(dof.name, calibration)
             yield AxisRow(
@@ -387,7 +408,9 @@ def _data(
     defaults = CalibratorConfig().to_options()
     options = snapshot.config.to_options() if snapshot else defaults
     changed = [
-        (name, value) for name, value in options.items() if value != defaults[name]
+        (name, value)
+        for name, value in options.items()
+        if value != defaults[name]
     ]
     kind = "stops"
     if evidence:
@@ -414,7 +437,9 @@ def _data(
     }
 
 
-def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str, str]:
+def _stream(
+    name: str, origin: Document, stream: Trajectory | None
+) -> dict[str, str]:
     """Return the row of a stream: source, poses, duration, rate, longest gap and path length.
 
     A value that is not known is "-".
@@ -426,7 +451,9 @@ def _stream(name: str, origin: Document, stream: Trajectory | None) -> dict[str,
     }
     row |= dict.fromkeys(("poses", "rate", "duration", "gap", "path"), "-")
     ends_ns = [
-        origin[key] for key in ("first_stamp_ns", "last_stamp_ns") if origin.get(key)
+        origin[key]
+        for key in ("first_stamp_ns", "last_stamp_ns")
+        if origin.get(key)
     ]
     if count and ends_ns:
         duration_s = (ends_ns[-1] - ends_ns[0]) * 1e-9

@@ -202,10 +202,14 @@ def as_drawn(
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = svg.replace('xlink:href="#', f'href="#{name}-')
     svg = svg.replace("url(#", f"url(#{name}-")
-    svg = re.sub(r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg)
+    svg = re.sub(
+        r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg
+    )
     # Coordinates of the elements path and use have two decimals: that is enough.
     svg = re.sub(
-        r"<[pu][^>]*>", lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]), svg
+        r"<[pu][^>]*>",
+        lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]),
+        svg,
     )
     for colour, variable in _VARIABLES.items():
         svg = svg.replace(colour.lower(), f"var(--{variable})")

@@ -38,7 +38,11 @@ from hand_eye_calib.offline.report.style import (
 # upwards. The title has the axis that points at the reader or away.
 VIEWS = {"xy": "along z", "xz": "along y", "yz": "along x"}
 # Titles for a vehicle, with x forward and z up.
-VIEWS_OF_VEHICLE = {"xy": "from above", "xz": "from the side", "yz": "from the front"}
+VIEWS_OF_VEHICLE = {
+    "xy": "from above",
+    "xz": "from the side",
+    "yz": "from the front",
+}
 
 
 class NotebookFigure(Figure):
@@ -89,7 +93,9 @@ def plot(calibration: Calibration, ax: Any = None) -> Figure:
         figure = NotebookFigure(figsize=(LOOK.width, 3.3), layout="constrained")
         FigureCanvasAgg(figure)
         draw_views(figure.subplots(1, 3), calibration)
-        figure.suptitle(calibration.headline, fontsize=8, fontweight="bold", wrap=True)
+        figure.suptitle(
+            calibration.headline, fontsize=8, fontweight="bold", wrap=True
+        )
         figure.supxlabel(caption_of_views(calibration), fontsize=7.5, wrap=True)
     return figure
 
@@ -100,7 +106,9 @@ def caption_of_views(*calibrations: Calibration) -> str:
     is_finite = np.isfinite(sigmas)
     text = "Axes of all sensors: x red, y green, z blue."
     if is_finite.any():
-        text += f" Ellipse: {LOOK.sigmas:g} standard deviations of the position."
+        text += (
+            f" Ellipse: {LOOK.sigmas:g} standard deviations of the position."
+        )
     unknown = np.array([*"xyz"])[~is_finite.all(axis=0)].tolist()
     if unknown:
         text += f" Unknown along {listing(unknown)}: the dashed line."
@@ -117,18 +125,26 @@ def draw_views(
     Several calibrations have the same parent sensor. ``titles`` has the keys of :data:`VIEWS`.
     """
     distances = [
-        float(np.linalg.norm(calibration.translation)) for calibration in calibrations
+        float(np.linalg.norm(calibration.translation))
+        for calibration in calibrations
     ]
     axis_m = LOOK.axis_share * max(*distances, LOOK.min_distance_m)
     for panel, (axes, title) in zip(panels, titles.items(), strict=True):
         rows = ["xyz".index(axis) for axis in axes]
         _draw_sensor(
-            panel, np.eye(4)[rows], calibrations[0].parent_frame, PARENT, axis_m, 6
+            panel,
+            np.eye(4)[rows],
+            calibrations[0].parent_frame,
+            PARENT,
+            axis_m,
+            6,
         )
         for calibration in calibrations:
             T = calibration.T_parent_child[rows]
             # A dotted line from the parent's origin to the child's.
-            panel.plot(*T[:, 3:] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1)
+            panel.plot(
+                *T[:, 3:] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1
+            )
             _draw_sensor(panel, T, calibration.child_frame, CHILD, axis_m, -14)
             _draw_uncertainty(panel, T, calibration, rows)
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
@@ -169,7 +185,12 @@ def _draw_uncertainty(
 
 
 def _draw_sensor(
-    panel: Axes, T: FloatArray, name: str, colour: str, axis_m: float, below: float
+    panel: Axes,
+    T: FloatArray,
+    name: str,
+    colour: str,
+    axis_m: float,
+    below: float,
 ) -> None:
     """Draw a sensor's axes and its name.
 

@@ -43,9 +43,13 @@ _OF_RULES: Mapping[str, Brief] = {
     "nothing_known": Brief(
         "this motion determines no axis", "Record again, with more turns."
     ),
-    "recordings_differ": Brief("the recordings differ", "Read the reasons below."),
+    "recordings_differ": Brief(
+        "the recordings differ", "Read the reasons below."
+    ),
     "unobservable": Brief("{axes} not determined", "Measure what is missing."),
-    "warning_finding": Brief("a stream may have a fault", "Read the reasons below."),
+    "warning_finding": Brief(
+        "a stream may have a fault", "Read the reasons below."
+    ),
     "ground": Brief("the ground contradicts {axes}", _TAPE),
     "recordings": Brief("the recordings scatter", "Read the reasons below."),
     "halves": Brief(
@@ -76,15 +80,19 @@ def of_reason(reason: Reason) -> Brief:
     """Return problem and next step of a reason for a verdict."""
     brief = _OF_RULES[reason.rule]
     if reason.is_finding:
-        step = capital(in_one_breath(reason.advice_on(Interface.NODE), brief.step))
+        step = capital(
+            in_one_breath(reason.advice_on(Interface.NODE), brief.step)
+        )
         return Brief(
-            in_one_breath(reason.sentence, brief.problem), f"{step.rstrip('.')}."
+            in_one_breath(reason.sentence, brief.problem),
+            f"{step.rstrip('.')}.",
         )
     has_all = len(reason.axes) in (0, len(AXES))
     axes = "the axes" if has_all else axes_in_words(reason.axes)
     problem = brief.problem.format(axes=axes)
     return Brief(
-        in_one_breath(problem, brief.problem.format(axes="some axes")), brief.step
+        in_one_breath(problem, brief.problem.format(axes="some axes")),
+        brief.step,
     )
 
 
@@ -94,7 +102,9 @@ def step_after(finding: Finding) -> str:
     The poses of the session keep an error, so a repair of the source needs a reset.
     """
     if finding.options:
-        settings = [f"{name} to {value}" for name, value in finding.options.items()]
+        settings = [
+            f"{name} to {value}" for name, value in finding.options.items()
+        ]
         return in_one_breath(
             f"Set {', '.join(settings)}.", "Set the parameters that are below."
         )

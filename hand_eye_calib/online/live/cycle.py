@@ -25,7 +25,11 @@ from hand_eye_calib.core.base.text import duration, in_sentences, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
-from hand_eye_calib.core.results.calibration import Calibration, SolveStatus, Verdict
+from hand_eye_calib.core.results.calibration import (
+    Calibration,
+    SolveStatus,
+    Verdict,
+)
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.online.live.describing import (
     NO_PAIRS,
@@ -169,7 +173,9 @@ class SolveCycle:
         self.goal.restart()
         self._results.restart()
 
-    def follow(self, config: CalibratorConfig, before: CalibratorConfig) -> None:
+    def follow(
+        self, config: CalibratorConfig, before: CalibratorConfig
+    ) -> None:
         """Apply changed options; check the streams again at once.
 
         If only targets have changed, the result stays and its verdict is computed anew, because the
@@ -188,20 +194,26 @@ class SolveCycle:
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
         has_same_values = replace(before, **targets) == config
-        has_same_names = before.given.difference(_TARGETS) == config.given.difference(
+        has_same_names = before.given.difference(
             _TARGETS
-        )
+        ) == config.given.difference(_TARGETS)
         if result is None or not (has_same_values and has_same_names):
             self.goal.follow(config.targets)
             return
-        targets["target_axes"] = parse_targets("target.axes", config.target_axes)
+        targets["target_axes"] = parse_targets(
+            "target.axes", config.target_axes
+        )
         self.result = replace(result, **targets)
         self.goal.retarget(self.result, config.targets)
 
     @property
     def published(self) -> Calibration | None:
         """Result to publish; None if there is none, or if the result is refuted."""
-        return None if self.result is None or is_refuted(self.result) else self.result
+        return (
+            None
+            if self.result is None or is_refuted(self.result)
+            else self.result
+        )
 
     @property
     def standing(self) -> Standing:
@@ -210,7 +222,11 @@ class SolveCycle:
             return Standing.NONE
         if is_refuted(self.result):
             return Standing.REFUTED
-        return Standing.CURRENT if self._failing_since_s is None else Standing.OUTDATED
+        return (
+            Standing.CURRENT
+            if self._failing_since_s is None
+            else Standing.OUTDATED
+        )
 
     @property
     def problem(self) -> str:
@@ -222,9 +238,13 @@ class SolveCycle:
         if is_refuted(result):
             reason = result.reasons[0]
             remedy = (
-                ", or remove it" if result.status is SolveStatus.CONTRADICTED else ""
+                ", or remove it"
+                if result.status is SolveStatus.CONTRADICTED
+                else ""
             )
-            return f"{reason.sentence}; {reason.advice_on(Interface.NODE)}{remedy}"
+            return (
+                f"{reason.sentence}; {reason.advice_on(Interface.NODE)}{remedy}"
+            )
         if failure is None or self._failing_since_s is None:
             return ""
         now_s = time.monotonic()
@@ -242,7 +262,9 @@ class SolveCycle:
         """
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
-        return replace(self.result, warnings=(*self.result.warnings, self.problem))
+        return replace(
+            self.result, warnings=(*self.result.warnings, self.problem)
+        )
 
     def snapshot(self) -> Snapshot | None:
         """Return the poses and options from which the result was computed; None without one."""
@@ -270,7 +292,10 @@ class SolveCycle:
                 continue
             del self._waiting[on_solved]
             text = f"still solving after {ANSWER_WITHIN_S:g} s (is the processor busy?)"
-            on_solved(False, f"{text}: the result will be in the log and on the topics")
+            on_solved(
+                False,
+                f"{text}: the result will be in the log and on the topics",
+            )
 
     def start_if_due(self) -> None:
         """Start a solve or a check if there are new poses and the pause after a solve is over."""
@@ -339,7 +364,9 @@ class SolveCycle:
         self._rest_until_s = time.monotonic() + answer.processor_s
         self._job_s = answer.seconds
         self._job_processor_s = answer.processor_s
-        if slow := slow_in_words(self._job_s, self._job_s, self._job_processor_s):
+        if slow := slow_in_words(
+            self._job_s, self._job_s, self._job_processor_s
+        ):
             self._log.warning(slow, key="slow")
         self._take_motion(answer)
         self._take_check(answer)
@@ -378,13 +405,17 @@ class SolveCycle:
         if has_just_begun(motion):
             return too_little_in_words(motion), ()
         if missing := what_is_missing(motion):
-            return in_sentences(missing), axes_by_hand(motion.hidden_axes(), motion)
+            return in_sentences(missing), axes_by_hand(
+                motion.hidden_axes(), motion
+            )
         failure = self._failure.what if self._failure is not None else ""
         return in_sentences(failure), ()
 
     def _with_warnings(self, calibration: Calibration) -> Calibration:
         """Return a calibration with findings and warnings of the session; log the warnings."""
-        warnings = tuple(dict.fromkeys((*self._option_warnings, *calibration.warnings)))
+        warnings = tuple(
+            dict.fromkeys((*self._option_warnings, *calibration.warnings))
+        )
         for warning in warnings:
             self._log.warning(warning)
         return self._with_findings(replace(calibration, warnings=warnings))
@@ -464,7 +495,11 @@ class SolveCycle:
         """
         findings = self.checks.findings
         if calibration.measured != "poses":
-            raw = [finding for finding in findings if finding.code in RAW_POSE_CODES]
+            raw = [
+                finding
+                for finding in findings
+                if finding.code in RAW_POSE_CODES
+            ]
             findings = merged(calibration.findings, raw)
         if calibration.findings == findings:
             return calibration
@@ -488,7 +523,9 @@ class SolveCycle:
         level, text = self._condition(accepts_poses, tf_static)
         result = None
         if self.result is not None:
-            result = state_of_result(self.result, time.monotonic() - self._solved_at_s)
+            result = state_of_result(
+                self.result, time.monotonic() - self._solved_at_s
+            )
         return ExtrinsicState(
             level=level,
             text=text,
@@ -506,18 +543,24 @@ class SolveCycle:
             standing=self.standing,
             problem=self.problem,
             priors=priors_of(self._session.calibrator.config),
-            contradicted=tuple(self.result.contradictions) if self.result else (),
+            contradicted=tuple(self.result.contradictions)
+            if self.result
+            else (),
             result=result,
         )
 
     def _slow_in_words(self) -> str:
         """Return a sentence about solves that take long, and the reason; empty if they do not."""
-        running_s = time.monotonic() - self._started_s if self.is_solving else 0.0
+        running_s = (
+            time.monotonic() - self._started_s if self.is_solving else 0.0
+        )
         return slow_in_words(
             max(running_s, self._job_s), self._job_s, self._job_processor_s
         )
 
-    def _condition(self, accepts_poses: bool, tf_static: BroadcastState) -> Condition:
+    def _condition(
+        self, accepts_poses: bool, tf_static: BroadcastState
+    ) -> Condition:
         """Return level and text of the gravest condition that applies."""
         result = self.result
         failure = self._failure
@@ -529,7 +572,10 @@ class SolveCycle:
             )
         if result is not None and self.problem:
             separator = ": " if self.standing is Standing.REFUTED else ", but "
-            return Level.WARN, f"{result.verdict.value}{separator}{self.problem}"
+            return (
+                Level.WARN,
+                f"{result.verdict.value}{separator}{self.problem}",
+            )
         if not accepts_poses:
             return (
                 Level.WARN,
@@ -537,7 +583,10 @@ class SolveCycle:
             )
         if result is None:
             return Level.WARN, self._why_no_result()
-        if broadcast is Broadcast.REFUSED and result.verdict is not Verdict.DO_NOT_USE:
+        if (
+            broadcast is Broadcast.REFUSED
+            and result.verdict is not Verdict.DO_NOT_USE
+        ):
             return Level.WARN, f"publish_tf is refused: {why_refused}"
         if failure is not None:
             return Level.WARN, failure.what
@@ -549,7 +598,8 @@ class SolveCycle:
     def _why_no_result(self) -> str:
         """Return the gravest finding and the failure of the newest solve."""
         texts = [
-            f"{Verdict.DO_NOT_USE.value}: {fault}" for fault in self.checks.faults()[:1]
+            f"{Verdict.DO_NOT_USE.value}: {fault}"
+            for fault in self.checks.faults()[:1]
         ]
         if self._failure is not None:
             texts.append(self._failure.what)
@@ -595,4 +645,8 @@ class SolveCycle:
         """Return the comparison with the installed transform, or why there is none yet."""
         if self.result is not None and self.result.comparison is not None:
             return with_axis_keys(self.result.comparison)
-        return Comparison(sentence=f"not compared yet: {why_not}") if why_not else None
+        return (
+            Comparison(sentence=f"not compared yet: {why_not}")
+            if why_not
+            else None
+        )

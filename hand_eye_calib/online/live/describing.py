@@ -31,9 +31,7 @@ _MIN_MOTION_S = 20.0
 _MIN_ROTATION_RAD = float(np.radians(30.0))
 
 # Advice while both streams have poses that cannot be paired.
-NO_PAIRS = (
-    "The poses of both sensors do not pair. Compare their clocks and their rates."
-)
+NO_PAIRS = "The poses of both sensors do not pair. Compare their clocks and their rates."
 
 # Solves that last longer than this (s) are reported, because advice and time left refer to the data
 # before the solve.
@@ -42,7 +40,9 @@ _SLOW_SOLVE_S = 10.0
 _BUSY_SHARE = 0.5
 
 
-def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition:
+def pause_of(
+    inputs: Mapping[str, InputState], accepts_poses: bool
+) -> Condition:
     """Return level and reason if no poses arrive; otherwise level OK and an empty text.
 
     The level is OK if every input rests and its state permits that: the robot is parked.
@@ -59,11 +59,18 @@ def pause_of(inputs: Mapping[str, InputState], accepts_poses: bool) -> Condition
     if len(paused) == len(inputs):
         level = max(state.level for state in paused.values())
     remedy = (
-        "continue to drive, or save" if level is Level.OK else "start its source again"
+        "continue to drive, or save"
+        if level is Level.OK
+        else "start its source again"
     )
-    streams = listing([f"{name} ({state.topic})" for name, state in paused.items()])
+    streams = listing(
+        [f"{name} ({state.topic})" for name, state in paused.items()]
+    )
     longest_s = max(state.silent_s or 0.0 for state in paused.values())
-    return level, f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}."
+    return (
+        level,
+        f"Paused: no pose of {streams} for {duration(longest_s)}; {remedy}.",
+    )
 
 
 def is_too_little(motion: Excitation) -> bool:
@@ -94,7 +101,9 @@ def is_held_up(seconds: float, processor_s: float) -> bool:
     return seconds >= _SLOW_SOLVE_S and processor_s < _BUSY_SHARE * seconds
 
 
-def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str:
+def slow_in_words(
+    seconds: float, last_s: float, last_processor_s: float
+) -> str:
     """Return a sentence about solves that take long, and the reason; empty if they do not.
 
     Parameters
@@ -109,9 +118,7 @@ def slow_in_words(seconds: float, last_s: float, last_processor_s: float) -> str
     is_busy = is_held_up(last_s, last_processor_s) or last_s < _SLOW_SOLVE_S
     word = "busy" if is_busy else "slow"
     # Whole tens: the sentence does not change with every second of a running solve.
-    return (
-        f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
-    )
+    return f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
 
 
 def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:

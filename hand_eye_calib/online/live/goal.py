@@ -25,7 +25,12 @@ from hand_eye_calib.core.assessment.excitation import (
     helpful_motion,
 )
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.text import amount, axes_in_words, capital, duration
+from hand_eye_calib.core.base.text import (
+    amount,
+    axes_in_words,
+    capital,
+    duration,
+)
 from hand_eye_calib.core.results.axes import what_is_known
 from hand_eye_calib.core.results.calibration import (
     Calibration,
@@ -35,7 +40,11 @@ from hand_eye_calib.core.results.calibration import (
 )
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.brief import of_reason
-from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress, Progress
+from hand_eye_calib.online.live.progress import (
+    AXIS_KEYS,
+    AxisProgress,
+    Progress,
+)
 
 # Bounds of the motion (s) that confirms a first result within the targets. Within these bounds, the
 # motion is as long as the motion of that result.
@@ -48,7 +57,9 @@ _MIN_MOTION_TO_JUDGE_S = 30.0
 
 # Values (s) to which a reported time left is rounded. Beyond the last finite step, the present
 # motion cannot reach the target.
-_STEPS_S = np.array([0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf])
+_STEPS_S = np.array(
+    [0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf]
+)
 
 # Values (s) to which the time of a confirmation is rounded up: it is known, not estimated.
 _CONFIRMING_STEPS_S = np.array([4.0, 8, 12, 16, 20, 30, 40, 50, 60, 75])
@@ -140,7 +151,9 @@ class Goal:
         ``by_hand`` are the axes that the sentence proposes to measure by hand.
         """
         if self._motion is None:
-            self.progress = replace(self._nothing_yet(sentence), by_hand=by_hand)
+            self.progress = replace(
+                self._nothing_yet(sentence), by_hand=by_hand
+            )
 
     def follow(self, targets: Targets) -> None:
         """Start over with new targets, because options have changed.
@@ -150,8 +163,12 @@ class Goal:
         self._targets = np.asarray(targets, dtype=float)
         has_result = self._motion is not None
         unknown = np.full(6, np.inf)
-        self._results = [replace(result, allowance=unknown) for result in self._results]
-        self._start_over("Solving with the new options." if has_result else _NO_RESULT)
+        self._results = [
+            replace(result, allowance=unknown) for result in self._results
+        ]
+        self._start_over(
+            "Solving with the new options." if has_result else _NO_RESULT
+        )
 
     def retarget(self, calibration: Calibration, targets: Targets) -> None:
         """Compare the session's result with new targets if no other option has changed.
@@ -164,7 +181,9 @@ class Goal:
         """
         self.follow(targets)
         if self._motion is not None:
-            self.add(calibration, self._motion, self._faults, period_s=self._period_s)
+            self.add(
+                calibration, self._motion, self._faults, period_s=self._period_s
+            )
 
     def add(
         self,
@@ -201,7 +220,9 @@ class Goal:
             self.progress = self._progress_at_goal(self.best)
         else:
             last_minute = newest_motion or motion
-            self.progress = self._progress_before_goal(calibration, ratios, last_minute)
+            self.progress = self._progress_before_goal(
+                calibration, ratios, last_minute
+            )
         return self.progress
 
     def _append(self, calibration: Calibration, motion_s: float) -> None:
@@ -213,7 +234,10 @@ class Goal:
             motion_s = self._results.pop().motion_s
         is_usable = not self._faults and not calibration.status.failure
         result = _Result(
-            motion_s, calibration.sigmas_measured, calibration.allowance, is_usable
+            motion_s,
+            calibration.sigmas_measured,
+            calibration.allowance,
+            is_usable,
         )
         self._results.append(result)
         # A confirmation also needs the last result before the longest confirming motion.
@@ -248,7 +272,9 @@ class Goal:
         ratios = np.full(6, np.inf)
         np.divide(sigmas_measured**2, allowed, out=ratios, where=allowed > 0.0)
         ratios[np.isin(AXES, newest.out_of_reach)] = 0.0
-        ratios[[dof.verdict is DofVerdict.PRIOR for dof in newest.observability]] = 0.0
+        ratios[
+            [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
+        ] = 0.0
         return ratios
 
     def _update_best(self, newest: Calibration, ratios: FloatArray) -> None:
@@ -261,14 +287,17 @@ class Goal:
             See :meth:`_variance_ratios`.
         """
         is_usable = (
-            newest.status is SolveStatus.OK and newest.verdict is not Verdict.DO_NOT_USE
+            newest.status is SolveStatus.OK
+            and newest.verdict is not Verdict.DO_NOT_USE
         )
         if not is_usable or self._faults or ratios.max() > 1.0:
             return
         if self.best is None and self._confirmation_s(newest) > 0.0:
             return
         # Axes that motion cannot improve do not count.
-        ratio = float((newest.sigmas / self._targets)[ratios > 0.0].max(initial=0.0))
+        ratio = float(
+            (newest.sigmas / self._targets)[ratios > 0.0].max(initial=0.0)
+        )
         if ratio <= _MAX_RATIO_TO_BEST * self._best_ratio:
             self.best = newest
             self._best_ratio = min(ratio, self._best_ratio)
@@ -346,7 +375,9 @@ class Goal:
             axes=axes,
         )
         if ratios.max() > 1.0:
-            progress = self._with_advice(progress, newest, ratios, newest_motion)
+            progress = self._with_advice(
+                progress, newest, ratios, newest_motion
+            )
         reason = self._reason_to_stop(newest)
         return replace(progress, sentence=reason) if reason else progress
 
@@ -364,22 +395,26 @@ class Goal:
         """
         is_out_of_reach = newest.allowance >= self._targets
         reachable = np.where(is_out_of_reach, 0.0, ratios)
-        limiting = int(np.argmax(reachable if reachable.max() > 1.0 else ratios))
+        limiting = int(
+            np.argmax(reachable if reachable.max() > 1.0 else ratios)
+        )
         axis = AXES[limiting]
         row = progress.axes[AXIS_KEYS[axis]]
         if is_out_of_reach[limiting]:
-            return _with_small_target(progress, axis, newest.allowance[limiting])
+            return _with_small_target(
+                progress, axis, newest.allowance[limiting]
+            )
         is_helpful = _is_helpful(newest_motion, axis)
         is_long = self._results[-1].motion_s >= _MIN_MOTION_TO_JUDGE_S
-        will_not_get_there = is_long and row.seconds_left == np.inf and not is_helpful
+        will_not_get_there = (
+            is_long and row.seconds_left == np.inf and not is_helpful
+        )
         assert self._motion is not None
         motion = capital(helpful_motion([axis], self._motion))
         by_hand = () if is_helpful else axes_by_hand([axis], self._motion)
         axis_text = axes_in_words([axis])
         if will_not_get_there:
-            sentence = (
-                f"This motion will not determine {axis_text} well enough. {motion}."
-            )
+            sentence = f"This motion will not determine {axis_text} well enough. {motion}."
         else:
             if is_helpful:
                 motion = "This motion is right, more of it"
@@ -391,9 +426,7 @@ class Goal:
                 progress = replace(progress, seconds_left=np.inf, axes=axes)
             if np.isfinite(progress.seconds_left):
                 left = duration(progress.seconds_left)
-                sentence = (
-                    f"Go on for about {left}, {axis_text} takes longest. {motion}."
-                )
+                sentence = f"Go on for about {left}, {axis_text} takes longest. {motion}."
             else:
                 sentence = f"{_not_yet_in_words(axis, ratios)}. {motion}."
         return replace(
@@ -408,7 +441,8 @@ class Goal:
         """Return the progress after the goal is reached, with the axes of the best result."""
         precision = what_is_known(best)
         return Progress(
-            sentence=self._reason_to_stop(best) or _done_in_words(best, precision),
+            sentence=self._reason_to_stop(best)
+            or _done_in_words(best, precision),
             done=not self._faults,
             precision=precision,
             seconds_left=0.0,
@@ -427,16 +461,23 @@ class Goal:
         # 5 % tolerance: a time slightly above a step is rounded down to it.
         steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
         has_infinite = (before == infinite) | (steps == infinite)
-        is_new = has_infinite | (steps == 0) | (steps >= before + _MIN_INCREASE_STEPS)
+        is_new = (
+            has_infinite
+            | (steps == 0)
+            | (steps >= before + _MIN_INCREASE_STEPS)
+        )
         # If an axis leaves its target again, its time rises to the smallest step only.
-        slower = np.clip(steps, before - _MAX_DECREASE_STEPS, np.maximum(before, 1))
+        slower = np.clip(
+            steps, before - _MAX_DECREASE_STEPS, np.maximum(before, 1)
+        )
         self._steps = np.where(is_new, steps, slower)
         return [float(seconds) for seconds in _STEPS_S[self._steps]]
 
     def _nothing_yet(self, sentence: str) -> Progress:
         """Return the progress of a session without a result."""
         return Progress(
-            sentence=sentence, axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6)
+            sentence=sentence,
+            axes=self._by_axis(np.full(6, np.inf), [np.inf] * 6),
         )
 
     def _by_axis(
@@ -517,13 +558,17 @@ def _not_yet_in_words(limiting: str, ratios: FloatArray) -> str:
     axes = [limiting]
     if np.isinf(ratios[AXES.index(limiting)]):
         axes = [
-            axis for axis, ratio in zip(AXES, ratios, strict=True) if ratio == np.inf
+            axis
+            for axis, ratio in zip(AXES, ratios, strict=True)
+            if ratio == np.inf
         ]
     verb = "is" if len(axes) == 1 else "are"
     return f"{axes_in_words(axes)} {verb} not determined well enough yet"
 
 
-def _with_small_target(progress: Progress, axis: str, allowance: float) -> Progress:
+def _with_small_target(
+    progress: Progress, axis: str, allowance: float
+) -> Progress:
     """Return the progress of a session whose target for an axis is below the allowance."""
     key = AXIS_KEYS[axis]
     sentence = _too_small_in_words(axis, progress.axes[key].target, allowance)

@@ -121,7 +121,9 @@ class StampGuard:
         if self._is_near(stamp_ns):
             if now_s < self._outdated_until_s:
                 return Judgement()
-            return Judgement(self._accept([(stamp_ns, message)]), self._drop_held())
+            return Judgement(
+                self._accept([(stamp_ns, message)]), self._drop_held()
+            )
         dropped = []
         if self._held:
             step_ns = abs(stamp_ns - self._held[-1][0])
@@ -131,7 +133,9 @@ class StampGuard:
                 dropped = self._drop_held()
         self._held.append((stamp_ns, message))
         judgement = (
-            self._accept_held(now_s) if len(self._held) >= MIN_HELD else Judgement()
+            self._accept_held(now_s)
+            if len(self._held) >= MIN_HELD
+            else Judgement()
         )
         return judgement._replace(dropped=dropped)
 
@@ -168,7 +172,9 @@ class StampGuard:
         """Whether a stamp is near the last accepted stamps."""
         distances = (abs(stamp_ns - recent_ns) for recent_ns in self._recent_ns)
         distance_ns = min(distances, default=math.inf)
-        return distance_ns <= NEAR_NS or distance_ns <= _PERIODS * self.period_ns()
+        return (
+            distance_ns <= NEAR_NS or distance_ns <= _PERIODS * self.period_ns()
+        )
 
     def _accept(self, messages: list[Stamped]) -> list[Stamped]:
         """Store the stamps of messages as accepted, and return the messages."""
@@ -198,7 +204,9 @@ class StampGuard:
         self._outdated_until_s = -math.inf
         if is_back:
             self._reset()
-        return Judgement(self._accept(messages), jumped_back=is_back and not has_begun)
+        return Judgement(
+            self._accept(messages), jumped_back=is_back and not has_begun
+        )
 
 
 class _Counts(NamedTuple):
@@ -256,7 +264,9 @@ class PoseInput:
         self._refused = Counter[str]()
         self._arrived = 0
         self._lost = 0
-        self._reports = deque([_Counts(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1)
+        self._reports = deque(
+            [_Counts(time.monotonic(), 0, 0, 0)], maxlen=_REPORTS + 1
+        )
         self._next_number: int | None = None
         self._has_fallen = False
         # Time (steady, s) of the last message.
@@ -302,7 +312,9 @@ class PoseInput:
 
     def resume(self) -> None:
         """Continue the session on disk."""
-        self._guard.resume(self._session.engines.statistics(self.name).last_stamp_ns)
+        self._guard.resume(
+            self._session.engines.statistics(self.name).last_stamp_ns
+        )
 
     # -------------------------------------------------------------- messages
 
@@ -316,7 +328,9 @@ class PoseInput:
             topic has several publishers, or the middleware has no numbers.
         """
         expected = self._next_number
-        self._next_number = None if sequence_number is None else sequence_number + 1
+        self._next_number = (
+            None if sequence_number is None else sequence_number + 1
+        )
         if expected is not None and sequence_number is not None:
             # Numbers that fall begin anew: the publisher was started again, or there is a second
             # publisher that is not discovered yet. Then the next rise is the turn of the first.
@@ -372,7 +386,11 @@ class PoseInput:
         self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
         gap_s = gap_ns * 1e-9
         silent_s = self.silent_s(now_s)
-        if silent_s is not None and gap_ns > NEAR_NS and gap_s > _STEP_RATIO * silent_s:
+        if (
+            silent_s is not None
+            and gap_ns > NEAR_NS
+            and gap_s > _STEP_RATIO * silent_s
+        ):
             self._log.warning(
                 f"{self.topic}: the stamps jump ahead by {gap_s:.3f} s within {silent_s:.3f} s "
                 "(a clock that was set? a gap in a bag that is played fast?)"
@@ -399,12 +417,16 @@ class PoseInput:
     def leave_out(self, message: str, reason: NoPoseError) -> None:
         """Count a message that has no pose on purpose, such as that of a tracker that is lost."""
         self._refused["no pose"] += 1
-        self._log.debug(f"{self.topic}: message {message} is left out: {reason}")
+        self._log.debug(
+            f"{self.topic}: message {message} is left out: {reason}"
+        )
 
     def _refuse_stamp(self, stamp_ns: int, text: str) -> None:
         """Refuse a message because of its stamp."""
         self.refuse(
-            with_stamp(stamp_ns), "corrupt stamp", text if stamp_ns else _STAMP_IS_0
+            with_stamp(stamp_ns),
+            "corrupt stamp",
+            text if stamp_ns else _STAMP_IS_0,
         )
 
     def _take(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
@@ -456,7 +478,8 @@ class PoseInput:
     def is_silent(self, steady_s: float) -> bool:
         """Whether messages have arrived, but arrive no longer."""
         return (
-            self._arrived_s is not None and steady_s - self._arrived_s > SILENT_AFTER_S
+            self._arrived_s is not None
+            and steady_s - self._arrived_s > SILENT_AFTER_S
         )
 
     def silent_s(self, steady_s: float) -> float | None:
@@ -468,7 +491,9 @@ class PoseInput:
         silent_s = self.silent_s(steady_s)
         if silent_s is None or not self.is_enabled:
             return False
-        return silent_s > max(PAUSED_AFTER_S, _PERIODS * self._guard.period_ns() * 1e-9)
+        return silent_s > max(
+            PAUSED_AFTER_S, _PERIODS * self._guard.period_ns() * 1e-9
+        )
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
         """Return the diagnostics. This method must be called at least once a second.
@@ -480,7 +505,9 @@ class PoseInput:
         may_rest : bool
             Whether silence is normal: there is a result, and the other input is silent too.
         """
-        now = _Counts(steady_s, self._arrived, self._lost, self._refused["no pose"])
+        now = _Counts(
+            steady_s, self._arrived, self._lost, self._refused["no pose"]
+        )
         oldest = self._reports[0]
         if steady_s - self._reports[-1].at_s > REPORT_PERIOD_S / 2:
             self._reports.append(now)
@@ -495,7 +522,9 @@ class PoseInput:
         )
         accepted = self._session.engines.statistics(self.name)
         if level is Level.OK and self._longest_gap_ns > NEAR_NS:
-            text = f"{text}, longest gap {duration(self._longest_gap_ns * 1e-9)}"
+            text = (
+                f"{text}, longest gap {duration(self._longest_gap_ns * 1e-9)}"
+            )
         advice = self._advice(null_share, accepted)
         if level is Level.OK and advice:
             self._log.warning(f"{self.topic}: {advice}")
@@ -515,7 +544,9 @@ class PoseInput:
             },
             lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
-            publishers=None if self.publishers is None else len(self.publishers),
+            publishers=None
+            if self.publishers is None
+            else len(self.publishers),
             is_paused=self.is_paused(steady_s),
             silent_s=self.silent_s(steady_s),
             step=step,
@@ -531,7 +562,10 @@ class PoseInput:
             )
         n_repeated = accepted.refused_duplicate
         n_messages = n_repeated + accepted.received
-        if n_messages < _MIN_MESSAGES or n_repeated <= _MAX_REPEATED_SHARE * n_messages:
+        if (
+            n_messages < _MIN_MESSAGES
+            or n_repeated <= _MAX_REPEATED_SHARE * n_messages
+        ):
             return ""
         return repeated_stamps(accepted.last_stamp_ns or 0)
 
@@ -566,7 +600,9 @@ class PoseInput:
         text = f"{share(lost_share)} of the messages are lost"
         advice = "Free processor time, or publish at a lower rate"
         self._log.warning(f"{self.topic}: {text}. {advice}")
-        return InputCondition(Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}")
+        return InputCondition(
+            Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}"
+        )
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
         """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""
@@ -591,7 +627,9 @@ class PoseInput:
 
 def repeated_stamps(stamp_ns: int) -> str:
     """Return fault and remedy of a stream whose stamps repeat; ``stamp_ns`` is one of them."""
-    kind = "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
+    kind = (
+        "repeat" if stamp_ns % STAMP_UNITS["s"] else "have whole seconds only"
+    )
     return f"the stamps {kind}: set header.stamp in the publisher for every message"
 
 

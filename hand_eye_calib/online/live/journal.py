@@ -104,7 +104,9 @@ class SessionJournal:
         # Used by the thread only; None while the journal cannot be written.
         self._writer: journal.JournalWriter | None = None
         self._jobs.put(partial(self._open, about(), resumed))
-        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name="journal", daemon=True
+        )
         self._thread.start()
 
     def flush(self) -> None:
@@ -150,7 +152,9 @@ class SessionJournal:
             # Even a defect of the program must not end the node, only the journal.
             except Exception as error:
                 self._writer = None
-                reason = str(error) if isinstance(error, OSError) else repr(error)
+                reason = (
+                    str(error) if isinstance(error, OSError) else repr(error)
+                )
                 self._give_up(getattr(error, "strerror", None) or reason)
 
     def _open(
@@ -163,8 +167,12 @@ class SessionJournal:
             if n_poses != 0:
                 count = "" if n_poses is None else f" ({n_poses} poses)"
                 aside = journal.keep_aside(self.directory)
-                self._log.info(f"the session before this one{count} is kept in {aside}")
-        self._writer = journal.JournalWriter(self.directory, about, resumed=resumed)
+                self._log.info(
+                    f"the session before this one{count} is kept in {aside}"
+                )
+        self._writer = journal.JournalWriter(
+            self.directory, about, resumed=resumed
+        )
 
     def _write(self, poses: list[_Pose], about: journal.About) -> None:
         if self._writer is not None:

@@ -41,7 +41,9 @@ class NodeLog:
         if self._is_due(f"info {key or text}", every_s):
             self._logger.info(_escaped(text))
 
-    def warning(self, text: str, every_s: float = ONCE_S, key: str = "") -> None:
+    def warning(
+        self, text: str, every_s: float = ONCE_S, key: str = ""
+    ) -> None:
         """Write a fault that a person should look at."""
         if self._is_due(f"warning {key or text}", every_s):
             self._logger.warning(_escaped(text))

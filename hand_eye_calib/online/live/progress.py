@@ -8,7 +8,9 @@ from hand_eye_calib.core.base.text import ABOUT
 from hand_eye_calib.core.results.records import AXES
 
 # Names of the six axes on topics. The Euler angles of a printed pose are roll, pitch and yaw.
-AXIS_KEYS = {axis: f"about_{ABOUT[axis]}" if axis in ABOUT else axis for axis in AXES}
+AXIS_KEYS = {
+    axis: f"about_{ABOUT[axis]}" if axis in ABOUT else axis for axis in AXES
+}
 
 
 @dataclass(frozen=True, kw_only=True)

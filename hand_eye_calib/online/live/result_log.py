@@ -21,7 +21,10 @@ class ResultLog:
         self._warned: dict[str, str] = {}
 
     def result(
-        self, calibration: Calibration, progress: Progress, every_s: float = GOES_ON_S
+        self,
+        calibration: Calibration,
+        progress: Progress,
+        every_s: float = GOES_ON_S,
     ) -> str:
         """Return a line about a calibration with its reasons and warnings; log what is new.
 
@@ -39,7 +42,9 @@ class ResultLog:
         texts = [describe(calibration)]
         self._log.info(texts[0], every_s, key="result")
         is_final = (
-            progress.done or progress.will_not_get_there or calibration.status.failure
+            progress.done
+            or progress.will_not_get_there
+            or calibration.status.failure
         )
         for reason in calibration.reasons:
             text = f"{reason.sentence}; {reason.advice_on(Interface.NODE)}"

@@ -36,7 +36,9 @@ class Saver:
         Newest save of this session.
     """
 
-    def __init__(self, session: LiveSession, cycle: SolveCycle, log: NodeLog) -> None:
+    def __init__(
+        self, session: LiveSession, cycle: SolveCycle, log: NodeLog
+    ) -> None:
         self.state: SavedState | None = None
         self._session = session
         self._cycle = cycle
@@ -70,7 +72,9 @@ class Saver:
         """
         directory = options.output_directory
         if not directory:
-            raise ConfigError("set the parameter output_directory to a directory")
+            raise ConfigError(
+                "set the parameter output_directory to a directory"
+            )
         result = self._cycle.result_to_save()
         snapshot = self._cycle.snapshot()
         if result is None or snapshot is None:
@@ -108,10 +112,14 @@ class Saver:
             files.append("rig/")
         if not files:
             return text
-        session = SessionResult(result, snapshot, inputs, options.report, others)
+        session = SessionResult(
+            result, snapshot, inputs, options.report, others
+        )
         return f"{text}; {self._write_pages(where, session, listing(files))}"
 
-    def _write_pages(self, directory: str, session: SessionResult, files: str) -> str:
+    def _write_pages(
+        self, directory: str, session: SessionResult, files: str
+    ) -> str:
         """Start the process that writes report and rig; return a sentence about the files.
 
         The start takes milliseconds. The process reads the result from a file without a name. No

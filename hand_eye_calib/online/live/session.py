@@ -5,10 +5,18 @@ from copy import deepcopy
 from dataclasses import fields, replace
 from pathlib import Path
 
-from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, defaults_of
+from hand_eye_calib.core.base.config import (
+    CalibratorConfig,
+    NodeConfig,
+    defaults_of,
+)
 from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError
 from hand_eye_calib.core.base.plain import Document
-from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator, Calibrators
+from hand_eye_calib.core.engine.calibrator import (
+    BufferLimits,
+    Calibrator,
+    Calibrators,
+)
 from hand_eye_calib.core.engine.snapshot import STREAMS
 from hand_eye_calib.formats.geodetic import LocalOrigin
 from hand_eye_calib.formats.journal import (
@@ -49,7 +57,9 @@ class LiveSession:
         self, log: NodeLog, config: CalibratorConfig, others: Sequence[str] = ()
     ) -> None:
         self.engines = Calibrators(child=Calibrator(config))
-        self.engines |= {name: Calibrator(_for_other_child(config)) for name in others}
+        self.engines |= {
+            name: Calibrator(_for_other_child(config)) for name in others
+        }
         self.number = 0
         self.topics: dict[str, str] = {}
         self.journal: SessionJournal | None = None
@@ -144,11 +154,15 @@ class LiveSession:
             self.journal.begin()
 
     def _n_poses(self) -> int:
-        return sum(self.calibrator.statistics(stream).received for stream in STREAMS)
+        return sum(
+            self.calibrator.statistics(stream).received for stream in STREAMS
+        )
 
     # -------------------------------------------------------------- journal
 
-    def start_journal(self, options: NodeConfig, is_first: bool = False) -> None:
+    def start_journal(
+        self, options: NodeConfig, is_first: bool = False
+    ) -> None:
         """Write a journal from now on, unless the options switch it off.
 
         Parameters
@@ -173,9 +187,13 @@ class LiveSession:
             and options.journal != "off"
             and not options.monitor
         ):
-            directory = output_path(options.output_directory).resolve() / "journal"
+            directory = (
+                output_path(options.output_directory).resolve() / "journal"
+            )
             resumed = self._resume(directory) if is_resuming else None
-            self.journal = SessionJournal(directory, self._about, self._log, resumed)
+            self.journal = SessionJournal(
+                directory, self._about, self._log, resumed
+            )
 
     def flush_journal(self) -> None:
         """Write new poses to the disk. This method must be called often."""
@@ -213,7 +231,9 @@ class LiveSession:
         Returns None if there is no session, or if the journal cannot be read.
         """
         if not has_session(directory):
-            self._log.info(f"no session to resume in {directory}: a new session begins")
+            self._log.info(
+                f"no session to resume in {directory}: a new session begins"
+            )
             return None
         try:
             journal = read_journal(directory)
@@ -226,7 +246,9 @@ class LiveSession:
         for stream, about in journal.about.items():
             if "origin" in about:
                 self.origin(stream).geodetic = tuple(about["origin"])
-        self._log.info(f"session resumed from {directory}: {self._n_poses()} poses")
+        self._log.info(
+            f"session resumed from {directory}: {self._n_poses()} poses"
+        )
         return journal
 
     def _about(self) -> dict[str, Document]:
@@ -277,7 +299,9 @@ def output_path(directory: str, base: Path | None = None) -> Path:
     try:
         path = Path(directory).expanduser()
     except RuntimeError as error:
-        text = f"output_directory {directory!r}: {error}; write the absolute path"
+        text = (
+            f"output_directory {directory!r}: {error}; write the absolute path"
+        )
         raise ConfigError(text) from None
     if base is not None and not path.resolve().is_relative_to(base):
         raise ConfigError(

@@ -24,10 +24,17 @@ from typing import Any
 
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.assessment.excitation import Excitation, excitation
-from hand_eye_calib.core.base.errors import HandEyeCalibError, NotEnoughDataError
+from hand_eye_calib.core.base.errors import (
+    HandEyeCalibError,
+    NotEnoughDataError,
+)
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.python_path import trusted_environment
-from hand_eye_calib.core.checks.check import MIN_DURATION_S, CheckResult, can_check
+from hand_eye_calib.core.checks.check import (
+    MIN_DURATION_S,
+    CheckResult,
+    can_check,
+)
 from hand_eye_calib.core.checks.findings import Finding, answered
 from hand_eye_calib.core.checks.streams import check_positions, check_stream
 from hand_eye_calib.core.engine.attempts import with_options
@@ -211,7 +218,10 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
     if not run.options:
         calibration = with_open_errors(result.calibration, run.check, snapshot)
         return replace(
-            result, check=run.check, messages=run.messages, calibration=calibration
+            result,
+            check=run.check,
+            messages=run.messages,
+            calibration=calibration,
         )
     warnings = tuple(map(_without_first_offset, run.calibration.warnings))
     return replace(
@@ -257,9 +267,13 @@ def with_findings_before_pairing(
             # A stream measures its positions only if the streams have positions. Otherwise, the
             # scale 0 removes them from the check.
             scale = 1.0 if config.measured == "positions" else 0.0
-            findings = check_positions(trajectory.scaled(scale), stream, config.max_gap)
+            findings = check_positions(
+                trajectory.scaled(scale), stream, config.max_gap
+            )
         errors += [
-            finding for finding in answered(findings, config) if finding.makes_unusable
+            finding
+            for finding in answered(findings, config)
+            if finding.makes_unusable
         ]
     return replace(result, findings=merged(result.findings, errors))
 
@@ -267,7 +281,9 @@ def with_findings_before_pairing(
 def _failure(error: Exception) -> Failure:
     """Return an error as a failure; with its traceback if the error is a defect of the program."""
     if isinstance(error, HandEyeCalibError):
-        return Failure(str(error), is_early=isinstance(error, NotEnoughDataError))
+        return Failure(
+            str(error), is_early=isinstance(error, NotEnoughDataError)
+        )
     details = "".join(traceback.format_exception(error))
     return Failure(f"{type(error).__name__}: {error}", details)
 
@@ -287,7 +303,9 @@ def main() -> None:
     threading.Thread(target=_receive, args=(jobs,), daemon=True).start()
     # On Linux, each thread has its own priority. Once lowered, a priority cannot be raised again.
     # So jobs without hurry have a thread for themselves.
-    at_low_priority = ThreadPoolExecutor(1, initializer=os.nice, initargs=(_NICENESS,))
+    at_low_priority = ThreadPoolExecutor(
+        1, initializer=os.nice, initargs=(_NICENESS,)
+    )
     while True:
         job = jobs.get()
         result = (
@@ -345,7 +363,9 @@ class SolvingProcess:
         Python code that the process runs.
     """
 
-    def __init__(self, on_answer: Callable[[], None], command: str = _SOLVE) -> None:
+    def __init__(
+        self, on_answer: Callable[[], None], command: str = _SOLVE
+    ) -> None:
         self._on_answer = on_answer
         self._command = command
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()

@@ -26,7 +26,9 @@ from hand_eye_calib.online.live.state import ChecksState, Level
 
 #: Codes of findings about the received poses of one stream. Pairing interpolates the poses, so a
 #: check of the pairs cannot detect these faults.
-RAW_POSE_CODES = frozenset({"leap", "interleaved", "frozen", "coarse_positions"})
+RAW_POSE_CODES = frozenset(
+    {"leap", "interleaved", "frozen", "coarse_positions"}
+)
 
 
 class StreamChecks:
@@ -118,7 +120,8 @@ class StreamChecks:
         findings = merged(self._result.findings, self._pose_errors.values())
         return ChecksState(
             level=Level.WARN if self._faults else Level.OK,
-            text="; ".join(self.faults()) or "both streams can be of one rigid body",
+            text="; ".join(self.faults())
+            or "both streams can be of one rigid body",
             age_s=time.monotonic() - self._checked_at_s,
             findings=tuple(
                 f"{finding.severity.value}: {_in_parameters(finding)}"
@@ -137,7 +140,9 @@ def merged(
     """
     keys = {(finding.code, finding.stream) for finding in newest}
     kept = [
-        finding for finding in earlier if (finding.code, finding.stream) not in keys
+        finding
+        for finding in earlier
+        if (finding.code, finding.stream) not in keys
     ]
     return gravest_first([*newest, *kept])
 
@@ -156,5 +161,7 @@ def _gravest_of(findings: Sequence[Finding]) -> dict[str, Any]:
 
 def _in_parameters(finding: Finding) -> str:
     """Return the text of a finding in one line, with the parameters to set."""
-    remedies = (f": set {name} to {value}" for name, value in finding.options.items())
+    remedies = (
+        f": set {name} to {value}" for name, value in finding.options.items()
+    )
     return f"{finding}{''.join(remedies)}"

@@ -34,16 +34,18 @@ _PARAMETERS = "All parameters (-p NAME:=VALUE) are in config/calibrator.yaml, wi
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare usage and help of the command. The node itself reads its arguments."""
-    parser.usage = (
-        "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
-    )
+    parser.usage = "%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]"
     parser.set_defaults(brief=f"{_BRIEF}\n\n{_PARAMETERS}")
     epilog = f"{_BRIEF}\n\nparameters (-p NAME:=VALUE):\n"
-    for name, field in (CalibratorConfig.by_name() | NodeConfig.by_name()).items():
+    for name, field in (
+        CalibratorConfig.by_name() | NodeConfig.by_name()
+    ).items():
         value = " ".join(
             filter(None, (json.dumps(field.default), field.metadata["unit"]))
         )
-        doc = textwrap.indent(textwrap.fill(field.metadata["doc"], 90), "      ")
+        doc = textwrap.indent(
+            textwrap.fill(field.metadata["doc"], 90), "      "
+        )
         epilog += f"  {name} ({value})\n{doc}\n"
     parser.epilog = epilog.replace("%", "%%")
 

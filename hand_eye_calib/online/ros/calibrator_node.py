@@ -14,13 +14,20 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import (
+    PublisherEventCallbacks,
+    SubscriptionEventCallbacks,
+)
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from hand_eye_calib.core.base.config import CalibratorConfig, NodeConfig, other_names
+from hand_eye_calib.core.base.config import (
+    CalibratorConfig,
+    NodeConfig,
+    other_names,
+)
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.registry import MOUNT_MONITORS
 from hand_eye_calib.core.base.text import listing
@@ -35,7 +42,11 @@ from hand_eye_calib.online.live.session import LiveSession, output_path
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S, NodeState, Outcome
 from hand_eye_calib.online.ros.inputs import TfInput, TopicInput
 from hand_eye_calib.online.ros.lifecycle import ManagedNode
-from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC, ResultTopics, StateTopics
+from hand_eye_calib.online.ros.outputs import (
+    PROGRESS_TOPIC,
+    ResultTopics,
+    StateTopics,
+)
 from hand_eye_calib.online.ros.parameters import Parameters
 from hand_eye_calib.online.ros.tf import (
     TF,
@@ -74,7 +85,8 @@ class CalibratorNode(ManagedNode):
     def __init__(self) -> None:
         try:
             super().__init__(
-                "calibrator", automatically_declare_parameters_from_overrides=True
+                "calibrator",
+                automatically_declare_parameters_from_overrides=True,
             )
         except ValueError as error:
             raise ConfigError(
@@ -82,7 +94,9 @@ class CalibratorNode(ManagedNode):
             ) from None
         self._log = NodeLog(self.get_logger())
         self._output_base: Path | None = None
-        self._options = Parameters(self, self._follow_parameters, self._check_options)
+        self._options = Parameters(
+            self, self._follow_parameters, self._check_options
+        )
         for line in self._options.unknown:
             self._log.warning(line)
         self._inputs: list[TopicInput | TfInput] = []
@@ -103,7 +117,9 @@ class CalibratorNode(ManagedNode):
         options = self._options.node
         config = self._options.calibrator
         # From now on, participants may only choose a directory below this directory.
-        self._output_base = output_path(options.output_directory or ".").resolve()
+        self._output_base = output_path(
+            options.output_directory or "."
+        ).resolve()
         if options.monitor:
             config.require_poses("monitor")
         # Raises an error for an impossible combination.
@@ -117,14 +133,18 @@ class CalibratorNode(ManagedNode):
             message_type("base_frame" if options.base_frame else "installed")
             tree.listen()
         self._tf = TfBroadcaster(self, self._log, tree)
-        self._inputs = [self._make_input(name) for name in ("parent", "child", *others)]
+        self._inputs = [
+            self._make_input(name) for name in ("parent", "child", *others)
+        ]
         self._start_session()
         self._made.callback(self._session.stop_journal)
         self._results = ResultTopics(self)
         self._states = StateTopics(self)
         self._tf.switch(options.publish_tf)
         self._mount = self._watch_mount() if options.monitor else None
-        answered = self.create_guard_condition(lambda: self._cycle.take_answers())
+        answered = self.create_guard_condition(
+            lambda: self._cycle.take_answers()
+        )
         self._cycle = SolveCycle(
             self._session,
             self._log,
@@ -187,7 +207,9 @@ class CalibratorNode(ManagedNode):
         if len(set(topics.values())) < len(topics):
             text = "two inputs have the same topic: remap one to the topic of another sensor"
             raise ConfigError(f"{text}: {listing([*topics.values()])}")
-        self._session.topics = {name: topics[name] for name in ("parent", "child")}
+        self._session.topics = {
+            name: topics[name] for name in ("parent", "child")
+        }
         self._session.start_journal(self._options.node, is_first=True)
         for source in self._inputs:
             source.resume()
@@ -217,7 +239,9 @@ class CalibratorNode(ManagedNode):
         """Return a new monitor of the mount."""
         robot = self._robot
         make = MOUNT_MONITORS["installed"]
-        return make(self._session, robot.installed, lambda: robot.problem, self._log)
+        return make(
+            self._session, robot.installed, lambda: robot.problem, self._log
+        )
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
         """Return the input of a sensor: from transforms if an option names frames for it."""
@@ -242,11 +266,16 @@ class CalibratorNode(ManagedNode):
         # A group of its own: while this callback awaits a solve, no other callback of its group
         # could run.
         serve(
-            Trigger, "~/solve", self._on_solve, callback_group=ReentrantCallbackGroup()
+            Trigger,
+            "~/solve",
+            self._on_solve,
+            callback_group=ReentrantCallbackGroup(),
         )
         serve(Trigger, "~/save", partial(self._answer, self._save))
         serve(Trigger, "~/reset", partial(self._answer, self._reset))
-        serve(SetBool, "~/set_enabled", partial(self._answer, self._set_enabled))
+        serve(
+            SetBool, "~/set_enabled", partial(self._answer, self._set_enabled)
+        )
 
     def _start_timers(self) -> None:
         """Start the timers for solves and for all other periodic tasks."""
@@ -283,7 +312,8 @@ class CalibratorNode(ManagedNode):
         silent = [source for source in self._inputs if not source.has_poses]
         if silent and silent[0].is_enabled:
             texts = [
-                f"no pose yet on {source.topic}: {source.problem}" for source in silent
+                f"no pose yet on {source.topic}: {source.problem}"
+                for source in silent
             ]
             self._log.info("; ".join(texts), GOES_ON_S)
         self._cycle.start_if_due()
@@ -342,7 +372,9 @@ class CalibratorNode(ManagedNode):
             may_rest = is_parked and (is_done or source.publishers != ())
             inputs[source.name] = source.state(steady_s, may_rest)
         if self._mount is not None:
-            return NodeState(node=name, mount=self._mount.state(), inputs=inputs)
+            return NodeState(
+                node=name, mount=self._mount.state(), inputs=inputs
+            )
         pause = pause_of(inputs, accepts_poses)
         return NodeState(
             node=name,
@@ -383,7 +415,9 @@ class CalibratorNode(ManagedNode):
     ) -> Trigger.Response:
         """Solve, and answer the request when the solve has ended."""
         solved = Future()
-        self._cycle.ask(lambda is_good, text: solved.set_result((is_good, text)))
+        self._cycle.ask(
+            lambda is_good, text: solved.set_result((is_good, text))
+        )
         response.success, response.message = await solved
         return response
 
@@ -429,7 +463,10 @@ class CalibratorNode(ManagedNode):
         if self._options.node.lifecycle:
             return False, "this is a managed node: activate or deactivate it"
         self.accept_poses(request.data)
-        return True, "accepting poses" if request.data else "not accepting poses"
+        return (
+            True,
+            "accepting poses" if request.data else "not accepting poses",
+        )
 
     # ------------------------------------------------------------ parameters
 

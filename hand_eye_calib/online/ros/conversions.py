@@ -21,7 +21,9 @@ _LATCHING = DurabilityPolicy.TRANSIENT_LOCAL
 # QoS of a latched publisher: late subscribers receive its last message.
 LATCHED = QoSProfile(depth=1, reliability=_RELIABLE, durability=_LATCHING)
 # QoS of a subscription that receives the last message of every latched publisher.
-LISTENING = QoSProfile(depth=_QUEUE, reliability=_RELIABLE, durability=_LATCHING)
+LISTENING = QoSProfile(
+    depth=_QUEUE, reliability=_RELIABLE, durability=_LATCHING
+)
 
 
 def quick() -> QoSProfile:
@@ -74,7 +76,9 @@ def to_transform(
     return message
 
 
-def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamped:
+def to_pose_with_covariance(
+    calibration: Calibration,
+) -> PoseWithCovarianceStamped:
     """Return the child sensor's pose in the parent sensor's frame.
 
     The message is geometry_msgs/PoseWithCovarianceStamped with a covariance as in REP 103.
@@ -91,6 +95,8 @@ def to_pose_with_covariance(calibration: Calibration) -> PoseWithCovarianceStamp
 
 def fill(position: Any, orientation: Any, T_target_source: FloatArray) -> None:
     """Write a transform into the position and the orientation of a message."""
-    position.x, position.y, position.z = se3.translation_of(T_target_source).tolist()
+    position.x, position.y, position.z = se3.translation_of(
+        T_target_source
+    ).tolist()
     quat_xyzw = se3.to_quat_xyzw(T_target_source).tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw

@@ -8,7 +8,10 @@ from typing import Any, TypeAlias
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.qos_overriding_options import (
+    InvalidQosOverridesError,
+    QoSOverridingOptions,
+)
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -21,10 +24,22 @@ from hand_eye_calib.formats.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.online.live.input import PoseInput, with_stamp
 from hand_eye_calib.online.live.log import NodeLog
 from hand_eye_calib.online.live.session import LiveSession
-from hand_eye_calib.online.ros.conversions import LISTENING, message_class, quick
-from hand_eye_calib.online.ros.tf import DYNAMIC_TOPIC, STATIC_TOPIC, message_type
+from hand_eye_calib.online.ros.conversions import (
+    LISTENING,
+    message_class,
+    quick,
+)
+from hand_eye_calib.online.ros.tf import (
+    DYNAMIC_TOPIC,
+    STATIC_TOPIC,
+    message_type,
+)
 
-_QOS_OVERRIDES = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
+_QOS_OVERRIDES = (
+    QoSPolicyKind.HISTORY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY,
+)
 
 # Message types in the order of preference, without the first entry of POSE_TYPES, "auto".
 _TYPES = (*POSE_TYPES[1:], *LIVE_READINGS)
@@ -68,11 +83,15 @@ class RosInput(PoseInput):
         before = self._arrived
         for subscription, callback in self._subscribed:
             handle = subscription.handle
-            take = partial(handle.take_message, subscription.msg_type, subscription.raw)
+            take = partial(
+                handle.take_message, subscription.msg_type, subscription.raw
+            )
             with handle:
                 # take() returns None at the end of the queue. The limit is for a queue that fills
                 # as fast as it is emptied.
-                for message in islice(iter(take, None), subscription.qos_profile.depth):
+                for message in islice(
+                    iter(take, None), subscription.qos_profile.depth
+                ):
                     callback(*message)
         return self._arrived > before
 
@@ -90,9 +109,13 @@ class TopicInput(RosInput):
         See :class:`RosInput`.
     """
 
-    def __init__(self, node: Node, name: str, wanted_type: str, parts: Parts) -> None:
+    def __init__(
+        self, node: Node, name: str, wanted_type: str, parts: Parts
+    ) -> None:
         self._relative_topic = f"{name}_odom"
-        super().__init__(name, node.resolve_topic_name(self._relative_topic), parts)
+        super().__init__(
+            name, node.resolve_topic_name(self._relative_topic), parts
+        )
         self._node = node
         self._wanted_type = wanted_type
         self._n_publishers = 0
@@ -108,7 +131,9 @@ class TopicInput(RosInput):
             cannot be used, the log has an error instead.
         """
         # Unlike count_publishers, this method of rclpy applies remappings to the topic.
-        publishers = self._node.get_publishers_info_by_topic(self._relative_topic)
+        publishers = self._node.get_publishers_info_by_topic(
+            self._relative_topic
+        )
         self._n_publishers = len(publishers)
         self.publishers = tuple(
             f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
@@ -137,9 +162,7 @@ class TopicInput(RosInput):
         wanted = _TYPES if is_auto else (self._wanted_type,)
         usable = [type_name for type_name in wanted if type_name in offered]
         if offered and not usable:
-            self.problem = (
-                f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
-            )
+            self.problem = f"it has type {listing(sorted(offered))}; expected {', '.join(wanted)}"
             self._log.warning(
                 f"{self.topic}: {self.problem}: remap {self._relative_topic} to a topic with poses"
             )
@@ -149,9 +172,12 @@ class TopicInput(RosInput):
 
     def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
         """Return why the middleware delivers no message of these publishers; empty if it does."""
-        offered = {publisher.qos_profile.reliability for publisher in publishers}
+        offered = {
+            publisher.qos_profile.reliability for publisher in publishers
+        }
         own = {
-            subscription.qos_profile.reliability for subscription, _ in self._subscribed
+            subscription.qos_profile.reliability
+            for subscription, _ in self._subscribed
         }
         if own != {ReliabilityPolicy.RELIABLE} or offered != {
             ReliabilityPolicy.BEST_EFFORT
@@ -212,7 +238,9 @@ class TopicInput(RosInput):
             stamp_ns = messages.Cursor(data, is_ros1=False).stamp_ns()
         except messages.MALFORMED as error:
             received_s = info["received_timestamp"] * 1e-9
-            self.refuse(f"received at {received_s:.3f} s", "malformed", str(error))
+            self.refuse(
+                f"received at {received_s:.3f} s", "malformed", str(error)
+            )
             return
         self.accept(stamp_ns, partial(self._read, data))
 
@@ -220,7 +248,9 @@ class TopicInput(RosInput):
 class TfInput(RosInput):
     """The poses of parent or child from ``/tf`` and ``/tf_static``."""
 
-    def __init__(self, node: Node, name: str, source: TfSource, parts: Parts) -> None:
+    def __init__(
+        self, node: Node, name: str, source: TfSource, parts: Parts
+    ) -> None:
         super().__init__(name, str(source), parts)
         self._stream = TfStream(source, max_gap_s=0.0)
         kind = message_type(f"{name}_tf")
@@ -245,7 +275,9 @@ class TfInput(RosInput):
         """Update the reason why there are no poses. This method must be called often."""
         self.problem = self._stream.describe_missing()
 
-    def _receive(self, topic: str, message: Any, info: Mapping[str, int]) -> None:
+    def _receive(
+        self, topic: str, message: Any, info: Mapping[str, int]
+    ) -> None:
         """Process the transforms of a message on ``/tf`` or ``/tf_static``."""
         for transform in map(messages.transform_of, message.transforms):
             try:
@@ -254,4 +286,6 @@ class TfInput(RosInput):
             except NoPoseError as error:
                 self.leave_out(with_stamp(transform.stamp_ns), error)
             except InputError as error:
-                self.refuse(with_stamp(transform.stamp_ns), "unusable", str(error))
+                self.refuse(
+                    with_stamp(transform.stamp_ns), "unusable", str(error)
+                )

@@ -135,7 +135,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
             "timers": self.destroy_timer,
             "guards": self.destroy_guard_condition,
         }
-        before = {kind: {id(item) for item in getattr(self, kind)} for kind in kinds}
+        before = {
+            kind: {id(item) for item in getattr(self, kind)} for kind in kinds
+        }
 
         def destroy() -> None:
             for kind, destroy_item in kinds.items():

@@ -87,7 +87,9 @@ def _axes(
     marker = Marker(ns=namespace, type=Marker.LINE_LIST)
     marker.scale.x = _AXIS_WIDTH_M
     fill(marker.pose.position, marker.pose.orientation, T_parent_sensor)
-    for direction, colour in zip(_AXIS_LENGTH_M * np.eye(3), colours, strict=True):
+    for direction, colour in zip(
+        _AXIS_LENGTH_M * np.eye(3), colours, strict=True
+    ):
         x, y, z = direction.tolist()
         marker.points += [Point(), Point(x=x, y=y, z=z)]
         marker.colors += [colour, colour]
@@ -97,7 +99,9 @@ def _axes(
 def _ellipsoid(calibration: Calibration) -> Marker:
     """Return the ellipsoid of the child's position, in the colour of the verdict."""
     T_parent_child = calibration.T_parent_child
-    covariance = turned(se3.rotation_of(T_parent_child), calibration.covariance)[:3, :3]
+    covariance = turned(
+        se3.rotation_of(T_parent_child), calibration.covariance
+    )[:3, :3]
     variances, directions = np.linalg.eigh(covariance)
     # Eigenvectors may be left-handed; a rotation is right-handed.
     directions[:, 2] *= np.linalg.det(directions)
@@ -130,7 +134,9 @@ def _text(calibration: Calibration) -> Marker:
             )
         else:
             lines.append(f"{axis} {value:.3f} +/- {sigma:.3f} m")
-    marker = Marker(ns="text", type=Marker.TEXT_VIEW_FACING, text="\n".join(lines))
+    marker = Marker(
+        ns="text", type=Marker.TEXT_VIEW_FACING, text="\n".join(lines)
+    )
     x, y, z = se3.translation_of(calibration.T_parent_child).tolist()
     marker.pose.position = Point(
         x=x, y=y, z=z + _AXIS_LENGTH_M + len(lines) * _TEXT_M / 2.0

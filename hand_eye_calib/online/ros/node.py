@@ -67,13 +67,18 @@ def _init(arguments: list[str]) -> int:
     try:
         if unknown := remove_ros_args(args=arguments):
             return fail(
-                f"unknown arguments {unknown}; ROS arguments follow --ros-args", 2
+                f"unknown arguments {unknown}; ROS arguments follow --ros-args",
+                2,
             )
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(
+            args=arguments, signal_handler_options=SignalHandlerOptions.NO
+        )
     except UnknownROSArgsError as error:
         return fail(f"unknown ROS arguments {error}", 2)
     except RCLError as error:
-        return fail(re.sub(r", at \S+:\d+", "", " ".join(str(error).split())), 1)
+        return fail(
+            re.sub(r", at \S+:\d+", "", " ".join(str(error).split())), 1
+        )
     set_logger_level("rcl", LoggingSeverity.UNSET)
     return 0
 
@@ -97,7 +102,9 @@ def _run_node(signals: int) -> int:
         # executor.wake() would not make spin_once() return; a task does.
         executor.create_task(stopping.set)
 
-    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+    threading.Thread(
+        target=wait_for_signal, name="signals", daemon=True
+    ).start()
     node = None
     code = 1
     try:

@@ -91,12 +91,18 @@ class StateTopics:
     """Publishes the node's state: as JSON on ``~/progress``, latched, and on ``/diagnostics``."""
 
     def __init__(self, node: Node) -> None:
-        self._progress = node.create_publisher(String, f"~/{PROGRESS_TOPIC}", LATCHED)
-        self._diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._progress = node.create_publisher(
+            String, f"~/{PROGRESS_TOPIC}", LATCHED
+        )
+        self._diagnostics = node.create_publisher(
+            DiagnosticArray, "/diagnostics", 10
+        )
 
     def publish(self, state: NodeState, clock_ns: int) -> None:
         """Publish the state at a time of the node's clock (ns); 0 if the clock does not run."""
-        self._progress.publish(String(data=json.dumps(plain(state), allow_nan=False)))
+        self._progress.publish(
+            String(data=json.dumps(plain(state), allow_nan=False))
+        )
         self._diagnostics.publish(diagnostics(state, clock_ns))
         if state.has_ended:
             self._progress.wait_for_all_acked(_GRACE)
@@ -117,13 +123,17 @@ def diagnostics(state: NodeState, clock_ns: int) -> DiagnosticArray:
             name=f"{state.node}: {name}",
             message=state.headline if name == "progress" else part.text,
             hardware_id="hand_eye_calib",
-            values=[KeyValue(key=key, value=text) for key, text in values.items()],
+            values=[
+                KeyValue(key=key, value=text) for key, text in values.items()
+            ],
         )
         message.status.append(status)
     return message
 
 
-def _values(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+def _values(
+    value: Any, path: tuple[str, ...] = ()
+) -> Iterator[tuple[str, str]]:
     """Yield the name and the text of each value in a part of the state.
 
     A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``. ``path``

@@ -131,13 +131,15 @@ def _checked(values: Options) -> Options:
 
 def _configs(values: Options) -> tuple[CalibratorConfig, NodeConfig]:
     """Return the option objects of parameters."""
-    of_node = {name: value for name, value in values.items() if name in _OF_NODE}
+    of_node = {
+        name: value for name, value in values.items() if name in _OF_NODE
+    }
     of_calibrator = {
         name: value for name, value in values.items() if name not in _OF_NODE
     }
-    return CalibratorConfig.from_options(of_calibrator), NodeConfig.from_options(
-        of_node
-    )
+    return CalibratorConfig.from_options(
+        of_calibrator
+    ), NodeConfig.from_options(of_node)
 
 
 def _descriptor(field: OptionField) -> ParameterDescriptor:
@@ -154,7 +156,9 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     if words:
         description += f" Values: {', '.join(words)}."
     descriptor = ParameterDescriptor(
-        description=description, read_only=meta["read_only"], dynamic_typing=is_dynamic
+        description=description,
+        read_only=meta["read_only"],
+        dynamic_typing=is_dynamic,
     )
     if meta["within"] is not None:
         low, high = meta["within"]

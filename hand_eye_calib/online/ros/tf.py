@@ -17,10 +17,18 @@ from rclpy.subscription import Subscription
 
 from hand_eye_calib.core.assessment.comparison import with_comparison
 from hand_eye_calib.core.base.config import NodeConfig
-from hand_eye_calib.core.base.errors import ConfigError, HandEyeCalibError, InputError
+from hand_eye_calib.core.base.errors import (
+    ConfigError,
+    HandEyeCalibError,
+    InputError,
+)
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.frames import Extrinsic, FrameTree, checked_pose
+from hand_eye_calib.core.geometry.frames import (
+    Extrinsic,
+    FrameTree,
+    checked_pose,
+)
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
@@ -102,9 +110,7 @@ class RobotTree(FrameTree):
         # The parent is unknown, or other edges form a circle.
         with contextlib.suppress(InputError):
             if child in self.above(parent):
-                return (
-                    f"{parent} is below {child} already: the edge would close a circle"
-                )
+                return f"{parent} is below {child} already: the edge would close a circle"
         return ""
 
     def _receive(self, topic: str, message: Any) -> None:
@@ -115,7 +121,10 @@ class RobotTree(FrameTree):
             frame = fields.sensor_frame or ""
             try:
                 edge = self.add(
-                    fields.world_frame, frame, None, is_static=topic == STATIC_TOPIC
+                    fields.world_frame,
+                    frame,
+                    None,
+                    is_static=topic == STATIC_TOPIC,
                 )
                 edge.pose = checked_pose(fields.position, fields.quat_xyzw)
             except InputError as error:
@@ -141,7 +150,9 @@ class Robot:
         If the installed transform cannot be read.
     """
 
-    def __init__(self, log: NodeLog, options: NodeConfig, frames: FrameTree) -> None:
+    def __init__(
+        self, log: NodeLog, options: NodeConfig, frames: FrameTree
+    ) -> None:
         self._log = log
         self._frames = frames
         self._source = options.installed
@@ -152,10 +163,14 @@ class Robot:
         self._installed_for = ("", "")
         from_tree = partial(stated, frames.pose, STATIC_TOPIC)
         self._read = (
-            from_tree if self._source in ("", TF) else open_installed(self._source)
+            from_tree
+            if self._source in ("", TF)
+            else open_installed(self._source)
         )
 
-    def installed(self, parent_frame: str, child_frame: str) -> Extrinsic | None:
+    def installed(
+        self, parent_frame: str, child_frame: str
+    ) -> Extrinsic | None:
         """Return the installed transform; None if it is unknown, or if no option requests it."""
         frames = parent_frame, child_frame
         # Inverted poses exchange the frames of their stream.
@@ -179,7 +194,9 @@ class Robot:
         If one axis of the translation, and no other axis, is not observable, this axis gets its
         installed value.
         """
-        installed = self.installed(calibration.parent_frame, calibration.child_frame)
+        installed = self.installed(
+            calibration.parent_frame, calibration.child_frame
+        )
         if installed is not None:
             calibration = with_comparison(calibration, installed)
             calibration = _with_axis_of(installed, calibration)
@@ -195,7 +212,9 @@ class Robot:
             )
             return calibration
         return replace(
-            calibration, base_frame=self._base_frame, T_base_parent=T_base_parent
+            calibration,
+            base_frame=self._base_frame,
+            T_base_parent=T_base_parent,
         )
 
     @property
@@ -209,7 +228,9 @@ class Robot:
         self._log.warning(problem)
 
 
-def _with_axis_of(installed: Extrinsic, calibration: Calibration) -> Calibration:
+def _with_axis_of(
+    installed: Extrinsic, calibration: Calibration
+) -> Calibration:
     """Return a result whose only unobservable axis has the installed value.
 
     The result is unchanged if several axes are unobservable, or if the axis is roll, pitch or yaw.
@@ -290,7 +311,9 @@ class TfBroadcaster:
                 "they restart"
             )
 
-    def _decide(self, result: Calibration | None, why_not: str) -> BroadcastState:
+    def _decide(
+        self, result: Calibration | None, why_not: str
+    ) -> BroadcastState:
         """Return whether to broadcast a result, and the reason if not."""
         if not self._is_on:
             return Broadcast.OFF, ""
@@ -305,7 +328,10 @@ class TfBroadcaster:
         if result.verdict is Verdict.DO_NOT_USE:
             return Broadcast.REFUSED, result.headline
         if unobservable := result.unobservable():
-            return Broadcast.REFUSED, f"{axes_in_words(unobservable)} not determined"
+            return (
+                Broadcast.REFUSED,
+                f"{axes_in_words(unobservable)} not determined",
+            )
         if not was_checked:
             return Broadcast.WAITING, "the transform tree is checked first"
         return Broadcast.ON, ""

@@ -150,7 +150,9 @@ class Session:
         request = _REQUESTS.get(key, "")
         if request not in self._board.view(now_s).buttons:
             return
-        is_confirmed = request == self._unconfirmed and now_s <= self._confirm_until_s
+        is_confirmed = (
+            request == self._unconfirmed and now_s <= self._confirm_until_s
+        )
         if request in _CONSEQUENCES and not is_confirmed:
             self._unconfirmed = request
             self._confirm_until_s = now_s + _CONFIRM_WITHIN_S
@@ -204,7 +206,8 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
             if code and shows_code:
                 # These colours are readable on light terminals, too.
                 live.update(
-                    Text.from_ansi(code, style="bright_white on black"), refresh=True
+                    Text.from_ansi(code, style="bright_white on black"),
+                    refresh=True,
                 )
             else:
                 live.update(screen(view, size.width, footer), refresh=True)
@@ -242,7 +245,9 @@ def _keyboard() -> Iterator[Callable[[], str]]:
 
     def pressed() -> str:
         keys = b""
-        while select.select([sys.stdin], [], [], 0)[0] and (read := os.read(0, 64)):
+        while select.select([sys.stdin], [], [], 0)[0] and (
+            read := os.read(0, 64)
+        ):
             keys += read
         return keys.decode(errors="replace")
 
@@ -258,5 +263,7 @@ def _address(text: str) -> tuple[str, int]:
     """Return host and port from PORT or HOST:PORT."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
-        raise argparse.ArgumentTypeError(f"expected PORT or HOST:PORT, got {text!r}")
+        raise argparse.ArgumentTypeError(
+            f"expected PORT or HOST:PORT, got {text!r}"
+        )
     return host.strip("[]"), int(port)

@@ -107,14 +107,18 @@ class Watcher:
             return
         now_s = time.monotonic()
         if parameters := self._parameters(request):
-            messages = [parameter.to_parameter_msg() for parameter in parameters]
+            messages = [
+                parameter.to_parameter_msg() for parameter in parameters
+            ]
             message = SetParameters.Request(parameters=messages)
             client = self._node.create_client(
                 SetParameters, f"{self._board.node}/set_parameters"
             )
         else:
             message = Trigger.Request()
-            client = self._node.create_client(Trigger, f"{self._board.node}/{request}")
+            client = self._node.create_client(
+                Trigger, f"{self._board.node}/{request}"
+            )
         self._requests[request] = _Request(client, message, now_s)
         self._board.answer(request, None, "asked ...", now_s)
 
@@ -142,7 +146,9 @@ class Watcher:
         for topic, types in topics:
             name, _, last = topic.rpartition("/")
             is_state = (
-                last == PROGRESS_TOPIC and name and "std_msgs/msg/String" in types
+                last == PROGRESS_TOPIC
+                and name
+                and "std_msgs/msg/String" in types
             )
             if (
                 is_state
@@ -156,11 +162,14 @@ class Watcher:
             (topic, type_name)
             for topic, types in topics
             for type_name in types
-            if type_name in POSE_TYPES and topic.rpartition("/")[0] not in self._sources
-            if topic not in self._board.inputs and self._node.count_publishers(topic)
+            if type_name in POSE_TYPES
+            and topic.rpartition("/")[0] not in self._sources
+            if topic not in self._board.inputs
+            and self._node.count_publishers(topic)
         ]
         lines = [
-            self._describe(topic, type_name) for topic, type_name in poses[:_MAX_NAMES]
+            self._describe(topic, type_name)
+            for topic, type_name in poses[:_MAX_NAMES]
         ]
         self._board.topics = tuple(
             lines or ["no other topic with poses is published here"]
@@ -171,7 +180,10 @@ class Watcher:
         publishers = self._node.get_publishers_info_by_topic(topic)
         texts = [type_name.rpartition("/")[2]]
         if publishers:
-            names = {publisher.qos_profile.reliability.name for publisher in publishers}
+            names = {
+                publisher.qos_profile.reliability.name
+                for publisher in publishers
+            }
             texts.append(" and ".join(sorted(names)).lower().replace("_", " "))
         return f"{topic} ({', '.join(texts)})"
 
@@ -203,4 +215,6 @@ class Watcher:
     def _end(self, name: str, is_good: bool, text: str) -> None:
         """Remove a request, and pass its answer on to the board."""
         self._node.destroy_client(self._requests.pop(name).client)
-        self._board.answer(name, is_good, printable(text) or "done", time.monotonic())
+        self._board.answer(
+            name, is_good, printable(text) or "done", time.monotonic()
+        )

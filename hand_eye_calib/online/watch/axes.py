@@ -39,7 +39,9 @@ _ON_A_VEHICLE = {
 _LARGEST_OUTSIDE = 0.99
 
 
-def bar_of(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) -> Bar:
+def bar_of(
+    axis: str, session: ProgressState, extrinsic: ExtrinsicState | None
+) -> Bar:
     """Return the bar of an axis."""
     row = session.progress.axes[AXIS_KEYS[axis]]
     target = amount(axis, row.target)
@@ -60,7 +62,9 @@ def bar_of(axis: str, session: ProgressState, extrinsic: ExtrinsicState | None) 
         is_out_of_reach = math.isfinite(row.seconds_left)
         word = "out of reach" if is_out_of_reach else "not seen yet"
         sigma = "" if is_out_of_reach else f"wanted: {target}"
-    meaning = _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
+    meaning = (
+        _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
+    )
     difference = _difference(axis, session)
     share = _share_of(row) if has_result else 0.0
     return Bar(_NAMES[axis], meaning, share, tone, word, sigma, difference)

@@ -112,26 +112,34 @@ class Board:
 
         ``now_s`` is the time (s) at which the state was received, on a steady clock.
         """
-        is_silent = not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
+        is_silent = (
+            not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
+        )
         is_displayed = state.node == (self._wanted or self.node)
         if is_displayed or (is_silent and not self._wanted):
             self._newest = state, now_s
 
-    def answer(self, request: str, good: bool | None, text: str, now_s: float) -> None:
+    def answer(
+        self, request: str, good: bool | None, text: str, now_s: float
+    ) -> None:
         """Store the answer to a request; ``good`` is None until the answer arrives."""
         tones = {None: Tone.BUSY, True: Tone.GOOD, False: Tone.ACT}
         self._answer = Line(tones[good], request, text), now_s
 
     def acknowledge(self) -> None:
         """Display the present alarm of the mount as acknowledged, until another alarm begins."""
-        self._acknowledged = _alarm_of(self._newest[0]) if self._newest else None
+        self._acknowledged = (
+            _alarm_of(self._newest[0]) if self._newest else None
+        )
 
     def view(self, now_s: float) -> View:
         """Return what to display at a time ``now_s`` (s), on the clock of :meth:`take`."""
         if self._newest is None:
             name = self._wanted or "a calibrator"
             text = f"No message from {name} yet. Is the node running, on the same ROS domain and "
-            return View(self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?")
+            return View(
+                self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?"
+            )
         state, received_s = self._newest
         view = _view(state, now_s - received_s)
         if view.word == MOVED and _alarm_of(state) == self._acknowledged:
@@ -217,12 +225,16 @@ def _with_mount(view: View, mount: MountState) -> View:
     if mount.since_ns and mount.newest_ns:
         facts = f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
     view = replace(
-        view, facts=facts, watched=tuple(mount_line(axis, mount) for axis in AXES)
+        view,
+        facts=facts,
+        watched=tuple(mount_line(axis, mount) for axis in AXES),
     )
     if view.word != MOVED:
         return view
     buttons = ("recalibrate", "acknowledge", "reset")
-    return replace(view, facts=f"{facts}; a reset ends the alarm", buttons=buttons)
+    return replace(
+        view, facts=f"{facts}; a reset ends the alarm", buttons=buttons
+    )
 
 
 def _buttons(state: NodeState, asked: str) -> Texts:
@@ -253,7 +265,9 @@ def _axes_by_hand(state: NodeState) -> Texts:
     axes = [*extrinsic.contradicted, *progress.by_hand]
     if progress.will_not_get_there and not progress.target_is_too_small:
         axes += [
-            axis for axis, key in AXIS_KEYS.items() if key == progress.limiting_axis
+            axis
+            for axis, key in AXIS_KEYS.items()
+            if key == progress.limiting_axis
         ]
     axes += extrinsic.priors
     return tuple(axis for axis in dict.fromkeys(axes) if axis in AXES)
@@ -267,7 +281,9 @@ def _facts(state: NodeState, is_old: bool) -> str:
     extrinsic = state.extrinsic
     if extrinsic is None or not extrinsic.n_poses:
         return ""
-    facts = f"{extrinsic.path_m:,.0f} m, {duration(extrinsic.motion_s)} of motion"
+    facts = (
+        f"{extrinsic.path_m:,.0f} m, {duration(extrinsic.motion_s)} of motion"
+    )
     is_paused = any(stream.is_paused for stream in state.inputs.values())
     is_refuted = extrinsic.standing is Standing.REFUTED
     has_age = extrinsic.result and not (is_old or is_paused or is_refuted)
@@ -285,8 +301,14 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
     """
     for name, part in state.parts():
         has_problem = part.level is not Level.OK and part.text
-        if name == "extrinsic" and state.standing in _WITHOUT_RESULT and has_problem:
-            yield Line(Tone.UNKNOWN if is_old else Tone.ACT, "solver", part.text)
+        if (
+            name == "extrinsic"
+            and state.standing in _WITHOUT_RESULT
+            and has_problem
+        ):
+            yield Line(
+                Tone.UNKNOWN if is_old else Tone.ACT, "solver", part.text
+            )
         if name in ("extrinsic", "progress", "mount"):
             continue
         text = part.text
@@ -326,13 +348,17 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
     if state.progress and (comparison := state.progress.comparison):
         tone = _TONES.get(comparison.verdict, Tone.UNKNOWN)
         yield Line(
-            tone, "compared with the installed transform", typeset(comparison.sentence)
+            tone,
+            "compared with the installed transform",
+            typeset(comparison.sentence),
         )
     if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
         yield _broadcast(state.extrinsic, state.has_ended)
     if state.saved:
         tone = _TONES.get(state.saved.verdict, Tone.GOOD)
-        yield Line(tone, "saved", f"{saved_at(state.saved)}: {state.saved.text}")
+        yield Line(
+            tone, "saved", f"{saved_at(state.saved)}: {state.saved.text}"
+        )
 
 
 def _prior_lines(state: NodeState) -> Iterator[Line]:
@@ -370,7 +396,14 @@ def state_of(text: str) -> NodeState | None:
         state = from_plain(NodeState, _printable(json.loads(text)))
         # Make a view as a trial: it raises an error for values that cannot be displayed.
         _view(state, 0.0)
-    except (TypeError, ValueError, KeyError, RecursionError, OverflowError, OSError):
+    except (
+        TypeError,
+        ValueError,
+        KeyError,
+        RecursionError,
+        OverflowError,
+        OSError,
+    ):
         return None
     return state
 

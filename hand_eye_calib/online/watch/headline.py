@@ -94,7 +94,9 @@ def _alarm(state: NodeState) -> Headline | None:
         part = condition.part
         if part is not None and part.level is condition.level:
             text = condition.text or part.text
-            sentence = _sentence(in_one_breath(text, condition.otherwise or text))
+            sentence = _sentence(
+                in_one_breath(text, condition.otherwise or text)
+            )
             return Headline(
                 condition.tone,
                 condition.word,
@@ -134,7 +136,9 @@ def _conditions(state: NodeState) -> Iterator[_Condition]:
     """Yield conditions that require a person, the gravest first."""
     # The inputs of further child sensors are displayed, but do not become a headline.
     inputs = [
-        stream for name, stream in state.inputs.items() if name in ("parent", "child")
+        stream
+        for name, stream in state.inputs.items()
+        if name in ("parent", "child")
     ]
     yield _Condition(
         Tone.BAD,
@@ -216,7 +220,9 @@ def _of_checks(checks: ChecksState) -> _Condition:
         checks.step,
         "reset" if checks.needs_reset else "",
         checks.gravest,
-        "the streams have a fault: read the checks below" if checks.gravest else "",
+        "the streams have a fault: read the checks below"
+        if checks.gravest
+        else "",
     )
 
 
@@ -240,7 +246,9 @@ def _activity(state: NodeState) -> Headline:
         text = in_one_breath(
             sentence, "The streams have a fault: read the reasons below."
         )
-        return Headline(Tone.ACT, CHECK_STREAMS, text, RESET_AFTER_REPAIR, "reset")
+        return Headline(
+            Tone.ACT, CHECK_STREAMS, text, RESET_AFTER_REPAIR, "reset"
+        )
     if session.progress.done:
         return _at_goal(state, session)
     tone = Tone.BUSY if session.level is Level.OK else Tone.ACT
@@ -249,14 +257,20 @@ def _activity(state: NodeState) -> Headline:
     return _under_way(tone, state, session)
 
 
-def _under_way(tone: Tone, state: NodeState, session: ProgressState) -> Headline:
+def _under_way(
+    tone: Tone, state: NodeState, session: ProgressState
+) -> Headline:
     """Return the headline of a session that receives poses and has not reached its goal."""
     sentence = _sentence(session.text)
     # Until the next result, neither bars nor advice change, whatever the person does.
     slow = state.extrinsic.slow if state.extrinsic else ""
     if state.result is None:
-        has_moved = state.extrinsic is not None and state.extrinsic.motion_s > 0.0
-        return Headline(Tone.BUSY, "GO ON" if has_moved else "START", sentence, slow)
+        has_moved = (
+            state.extrinsic is not None and state.extrinsic.motion_s > 0.0
+        )
+        return Headline(
+            Tone.BUSY, "GO ON" if has_moved else "START", sentence, slow
+        )
     if session.progress.target_is_too_small:
         return Headline(tone, CHANGE_TARGET, sentence, slow, "save")
     return Headline(
@@ -274,7 +288,11 @@ def _monitoring(mount: MountState) -> Headline:
 
 def _pause(tone: Tone, state: NodeState, sentence: str) -> Headline:
     """Return the headline of a session without new poses; ``sentence`` if the inputs rest."""
-    paused = {name: stream for name, stream in state.inputs.items() if stream.is_paused}
+    paused = {
+        name: stream
+        for name, stream in state.inputs.items()
+        if stream.is_paused
+    }
     if not paused:
         return Headline(tone, "PAUSED", sentence)
     longest_s = max(stream.silent_s or 0.0 for stream in paused.values())
@@ -322,7 +340,9 @@ def _displacement(difference: Difference) -> str:
     The bars contain the change of each axis. If no single axis has moved, all axes that are
     determined count.
     """
-    known = [key for key, row in difference.axes.items() if math.isfinite(row.sigma)]
+    known = [
+        key for key, row in difference.axes.items() if math.isfinite(row.sigma)
+    ]
     moved = [key for key in known if difference.axes[key].verdict == "moved"]
     squares = {"m": 0.0, "rad": 0.0}
     for axis, key in AXIS_KEYS.items():
@@ -352,7 +372,9 @@ def _end(state: NodeState) -> Headline:
     text = "The node has ended"
     saved = state.saved
     if state.mount is not None:
-        return Headline(Tone.ACT, "ENDED", f"{text}: the mount is not monitored.")
+        return Headline(
+            Tone.ACT, "ENDED", f"{text}: the mount is not monitored."
+        )
     if saved is None:
         reason = (
             "The result is not saved: the log contains the reason."
@@ -365,10 +387,15 @@ def _end(state: NodeState) -> Headline:
     if saved.verdict == "DO NOT USE":
         caution = caution or f"{saved.verdict}: read the reasons below."
         return Headline(
-            Tone.BAD, "ENDED", f"{caution} {saved_text}", "Mend that, and record again."
+            Tone.BAD,
+            "ENDED",
+            f"{caution} {saved_text}",
+            "Mend that, and record again.",
         )
     if state.result and caution:
-        return Headline(Tone.ACT, "ENDED", f"{caution} {saved_text}", state.result.step)
+        return Headline(
+            Tone.ACT, "ENDED", f"{caution} {saved_text}", state.result.step
+        )
     return Headline(Tone.GOOD, "ENDED", f"{text}. {saved_text}")
 
 

@@ -53,10 +53,15 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
     if view.bars:
         rows += [_bars(view, width), _dim(view.title), _pose(view)]
     if view.watched:
-        rows += [_dim("the mount, after ten minutes of motion"), _lines(view.watched)]
+        rows += [
+            _dim("the mount, after ten minutes of motion"),
+            _lines(view.watched),
+        ]
     rows.append(_lines(view.result + view.health))
     rows += [_dim(f"    - {reason}") for reason in view.reasons[:_MAX_REASONS]]
-    keys = [f"{KEYS[name]} {_LABELS.get(name, name)}   " for name in view.buttons]
+    keys = [
+        f"{KEYS[name]} {_LABELS.get(name, name)}   " for name in view.buttons
+    ]
     title = Text(f"hand_eye_calib watch {view.node}".rstrip())
     panel = Panel(Group(*rows), title=title, title_align="left")
     return Group(_dim(f" {''.join(keys)}q quit   {footer}".rstrip()), panel)
@@ -64,7 +69,9 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
 
 def lines(view: View) -> list[str]:
     """Return the headline and the answer to the last button, as lines for a file or a pipe."""
-    answers = [f"{line.tone.value} {line.name}: {line.text}" for line in view.answer]
+    answers = [
+        f"{line.tone.value} {line.name}: {line.text}" for line in view.answer
+    ]
     return [f"{view.tone.value} {view.word}: {view.text}", *answers]
 
 
@@ -75,7 +82,9 @@ def _dim(text: str) -> Text:
 def _pose(view: View) -> Table:
     """Return a table of the pose with two rows: x, y, z and roll, pitch, yaw."""
     table = Table.grid(padding=(0, 3))
-    values = [Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values]
+    values = [
+        Text.assemble((axis, "bold"), f" {text}") for axis, text in view.values
+    ]
     table.add_row(*values[:3])
     table.add_row(*values[3:])
     return table
@@ -89,7 +98,11 @@ def _bars(view: View, width: int) -> Table:
         cells: list[RenderableType] = [
             Text(bar.name, style="bold"),
             ProgressBar(
-                1.0, bar.share, _BAR_LENGTH, complete_style=style, finished_style=style
+                1.0,
+                bar.share,
+                _BAR_LENGTH,
+                complete_style=style,
+                finished_style=style,
             ),
             Text(f"{bar.tone.value} {bar.word}", style=style),
             Text(bar.sigma),

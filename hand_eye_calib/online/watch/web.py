@@ -70,13 +70,19 @@ def _user_key() -> str:
     """
     new_key = secrets.token_urlsafe(6)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
-        folder = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        folder = (
+            os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        )
         path = Path(folder, "hand_eye_calib", "watch_key")
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        descriptor = os.open(
+            path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600
+        )
         with open(descriptor, "r+") as file:
             status = os.fstat(descriptor)
-            is_private = status.st_uid == os.getuid() and not status.st_mode & 0o077
+            is_private = (
+                status.st_uid == os.getuid() and not status.st_mode & 0o077
+            )
             key = file.read()
             if is_private and re.fullmatch(r"[\w-]{8,}", key, re.ASCII):
                 return key
@@ -122,7 +128,9 @@ class WebServer(ThreadingHTTPServer):
                 f"cannot serve the page on {self._host}:{port}: {reason}; choose another with "
                 "--web PORT"
             ) from None
-        threading.Thread(target=self.serve_forever, name="web", daemon=True).start()
+        threading.Thread(
+            target=self.serve_forever, name="web", daemon=True
+        ).start()
 
     def addresses(self) -> list[str]:
         """Return addresses of the page.
@@ -138,7 +146,10 @@ class WebServer(ThreadingHTTPServer):
             probe.connect(("192.0.2.1", 9))
             if not self._host:
                 hosts.insert(0, str(probe.getsockname()[0]))
-        return [f"http://{host}:{self.server_port}/?key={self.key}" for host in hosts]
+        return [
+            f"http://{host}:{self.server_port}/?key={self.key}"
+            for host in hosts
+        ]
 
     def stop(self) -> None:
         """Close all connections."""
@@ -227,7 +238,11 @@ class _Handler(BaseHTTPRequestHandler):
         return hmac.compare_digest(key, self.server.key.encode())
 
     def _send(
-        self, status: HTTPStatus, content: bytes, name: str = "", policy: str = _POLICY
+        self,
+        status: HTTPStatus,
+        content: bytes,
+        name: str = "",
+        policy: str = _POLICY,
     ) -> None:
         media_type = _MEDIA_TYPES.get(name.rpartition(".")[2], "text/plain")
         self._begin(status, media_type, policy)
@@ -263,7 +278,9 @@ class _Handler(BaseHTTPRequestHandler):
             view = self.server.board.view(now_s)
             # Path.is_file would raise an error for a name that is too long.
             files = [
-                name for name in SAVED if os.path.isfile(f"{view.saved_in}/{name}")
+                name
+                for name in SAVED
+                if os.path.isfile(f"{view.saved_in}/{name}")
             ]
             html = fragment(view, files if view.saved_in else ())
             # The data of an event are one line.
@@ -290,9 +307,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     files : sequence of str
         Saved files to which the page may link.
     """
-    headline = (
-        f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', view.sentence)}"
-    )
+    headline = f"<h1>{_sign(view.tone)} {escape(view.word)}</h1>{_element('p', view.sentence)}"
     if view.advice:
         headline += _element("p", view.advice, "advice")
     if view.facts:
@@ -303,7 +318,10 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     bars = "".join(map(_bar, view.bars))
     if any(bar.meaning for bar in view.bars):
         bars = _SKETCH + bars
-    pose = [_element("dt", axis) + _element("dd", text) for axis, text in view.values]
+    pose = [
+        _element("dt", axis) + _element("dd", text)
+        for axis, text in view.values
+    ]
     # The first line of the result is the verdict. The reasons for the verdict follow it.
     reasons = _listed(view.reasons)
     if view.by_hand:
@@ -322,7 +340,9 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         + _section("topics", "topics with poses", _listed(view.topics))
         + _section("axes", axes_title, bars)
         + _section(
-            "axes", "the mount, after ten minutes of motion", _lines(view.watched)
+            "axes",
+            "the mount, after ten minutes of motion",
+            _lines(view.watched),
         )
         + '<div class="side">'
         + _section("pose", view.title, _wrapped("dl", pose))
@@ -334,7 +354,9 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
 def _section(name: str, title: str, content: str) -> str:
     """Return a section with a title; empty without content."""
     head = _element("h2", title) if title else ""
-    return f'<section class="{name}">{head}{content}</section>' if content else ""
+    return (
+        f'<section class="{name}">{head}{content}</section>' if content else ""
+    )
 
 
 def _element(tag: str, text: str, name: str = "") -> str:
