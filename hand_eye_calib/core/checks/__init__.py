@@ -1,1 +1,1 @@
-"""Stream checks: whether the two streams are plausible, before anything is solved."""
+"""Checks, before any solve, of whether both streams are plausible."""

@@ -1,10 +1,10 @@
 """Checks of two streams that agree, on one clock and in one unit of length.
 
-They detect faults that explain little of the motion and yet bias the extrinsic X. The sizes of
-faults are coefficients of the regressions in :mod:`~hand_eye_calib.core.checks.fault_regression`,
-which also explains regressor, group and bias by noise. Two regressions are used:
+They detect faults that explain little of the motion but bias the extrinsic X. The size of a fault
+is a coefficient of a regression in :mod:`~hand_eye_calib.core.checks.fault_regression`. The same
+module defines the words regressor, group and bias. There are two regressions:
 
-- ``slow``, over motions of some seconds: scales, gains, worlds that are turned or drift;
+- ``slow``, over motions of some seconds: scales, gains, turned or drifting worlds;
 - ``fast``, over motions of one second: delays and smoothing.
 """
 
@@ -53,51 +53,55 @@ from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
 _STREAMS = ("child", "parent")
 
-# A fault that a Regression estimates (a gain, for example) is reported only if it exceeds this
-# multiple of the bias that noise of its regressors may cause.
+# A gain, for example, is reported only if it exceeds the bias by this factor. The bias is the error
+# that noise of the regressors may cause (:meth:`Regression.biases`).
 BIASES = 2.0
 
-# Drift of an odometry along one axis, as a share of the distance. On a flat floor this drift is
-# the whole motion along z, and the other stream does not contain it.
+# Drift of an odometry along one axis, as a share of the distance travelled. On a flat floor the
+# whole motion along z is drift, and the other stream does not contain this drift.
 DRIFT_SHARE = 0.02
 
-# Two frames are called one frame if their distance is below this (m), or within its noise.
+# Two frames count as one frame if their distance (m) is below this limit, or within its noise.
 _SAME_M = 0.005
-# Largest angle (rad) between axes that are called parallel, unless its noise is larger.
+# Axes count as parallel below this angle (rad), or if the angle is within its noise.
 SAME_RAD = float(np.radians(0.3))
 # Frames are compared only if the standard deviation of their rotation (rad) is at most this.
 MAX_SIGMA_RAD = float(np.radians(0.5))
-# A distance or an angle may be zero if it is below this number of standard deviations.
+# Below this number of standard deviations, a distance or an angle may be zero.
 ZERO_SIGMAS = 3.0
 
-# Upper bounds of a lever arm (m), two standard deviations above its length. Below the first one,
-# two sensors with different orientations are called one place: no two sensors are closer.
+# The next three limits are compared with the length of the lever arm plus two standard deviations.
+# Two sensors with different orientations are an error below this length (m): no two sensors are so
+# close.
 _SAME_POSITION_M = 0.002
-# Below this bound the finding is a warning: hardly two sensors are mounted closer.
+# Two sensors with different orientations are a warning below this length (m).
 _NEARLY_M = 0.012
-# The same bound for sensors with parallel axes, which are no accident.
+# Two sensors with parallel axes are suspicious below this length (m): parallel axes are no
+# accident.
 _PARALLEL_M = 0.03
 
-# Gains are estimated about axes with at least this share of the rotation (root mean square) about
-# the main axis.
+# A gain about an axis is estimated only if the rotation about this axis (root mean square) is at
+# least this share of the rotation about the main axis.
 _MIN_ROTATION_SHARE = 0.1
 
-# A coordinate explains why streams disagree if it removes more than this share of the squared
-# residuals.
+# Smallest share of the squared residuals that a wrong coordinate must explain if the streams
+# disagree.
 _EXPLAINING_SHARE = 0.3
-# A fault that explains at most this share is no error: jumps of a clean recording may cause it.
+# A fault is at most a warning if it explains less than this share of the squared residuals: jumps
+# of a clean recording may explain as much.
 _ERROR_SHARE = 0.1
 
-# Duration (s) and largest number of short motions, in which delays and smoothing are estimated.
+# Duration (s) of the short motions from which delays and smoothing are estimated.
 SHORT_S = 1.0
+# Largest number of such motions.
 MAX_SHORT_MOTIONS = 6000
-# Smallest delay (s) that is reported: streams of vehicles without faults differ by some
+# Smallest delay (s) that is reported. Without a fault, the streams of vehicles differ by
 # milliseconds.
 _MIN_DELAY_S = 2.5 * FLOOR_TRAVEL_S
 # Smallest delay (s) that is an error.
 _ERROR_DELAY_S = 2.0 * _MIN_DELAY_S
-# Factor of the standard deviation of a delay that equals the clock offset: such a delay is
-# expected, so that less evidence suffices.
+# The standard deviation of a delay is multiplied by this factor if the delay equals the clock
+# offset: such a delay is expected, and needs less evidence.
 _EXPECTED_SIGMA_SHARE = 2.0 / 3.0
 # A delay is always an error if it exceeds this time (s), this number of standard deviations, and
 # either the error limit of the shift, or the shift (m) and the explained share below. The largest
@@ -106,12 +110,12 @@ _ALWAYS_ERROR_S = 0.04
 _ALWAYS_ERROR_SIGMAS = 8.0
 _ALWAYS_ERROR_SHIFT_M = 0.02
 _ALWAYS_ERROR_SHARE = 0.35
-# Factor that lifts a size just above the limit of errors.
+# Multiple of the error limit that makes a fault an error, just above the limit.
 _JUST_ABOVE = 1.001
 
-# Smallest smoothing (s^2) that is reported, of positions and of orientations.
+# Smallest smoothing (s^2) that is reported. For the definition see the module fault_regression.
 _MIN_SMOOTHING_S2 = {"positions": 0.003, "orientations": 0.002}
-# Smoothing that interpolation of poses causes, as a share of the squared interval between poses.
+# Smoothing by the interpolation of poses, as a share of the squared interval between poses.
 _INTERPOLATION_SHARE = 0.25
 
 
@@ -146,12 +150,12 @@ def check_agreement(
     best: ExtrinsicEstimate,
     offset_s: float,
 ) -> Agreement:
-    """Return the finding about a fault of two streams that agree, or none, and the open delay.
+    """Return the finding about a fault of two agreeing streams, or none, and the open delay.
 
-    One fault changes the residuals of several groups. The group that explains most names the
-    fault, and the fault is reported if it is significant. If a drift between the odometries
-    explains most, a shift of the mount, turned worlds or a scale of one axis are not reported:
-    they resemble a drift.
+    One fault changes the residuals of several groups. Therefore only the group that explains most
+    of the residuals is reported, if it is significant. If a drift between the odometries explains
+    most, three faults that resemble a drift are not reported: a moved mount, turned worlds, and
+    another scale on one axis.
 
     Parameters
     ----------
@@ -193,8 +197,8 @@ def slow_suspects(
 ) -> list[Suspect]:
     """Return the fault that explains most of the motions over some seconds.
 
-    If it is a rotation between positions and orientations, all three such faults are returned:
-    they explain about the same, and any of them may be significant.
+    A rotation between positions and orientations is the exception: all three such faults are
+    returned, because they explain about the same share, and any of them may be significant.
     """
     change = find_change(pose_pairs, X)
     slow, axes = motion_regression(
@@ -225,7 +229,7 @@ def slow_suspects(
 def check_coordinates(
     pose_pairs: PosePairs, motions: MotionPairs
 ) -> list[Finding]:
-    """Return the finding about a coordinate that explains why two streams disagree, or none.
+    """Return the finding that the scale of one coordinate makes two streams disagree, or none.
 
     The rotations of both streams must agree.
     """
@@ -243,7 +247,7 @@ def check_coordinates(
 
 
 def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:
-    """Return the finding about an extrinsic, or its translation, of zero, or none."""
+    """Return the finding that an extrinsic, or its translation, is zero; otherwise none."""
     sigma_m = float(extrinsic.sigmas[:3].max())
     sigma_rad = float(extrinsic.sigmas[3:].max())
     distance_m = float(
@@ -271,18 +275,18 @@ def check_same(extrinsic: ExtrinsicEstimate) -> list[Finding]:
 
 
 def rotation_gain(slow: Regression, axes: FloatArray) -> Finding | None:
-    """Return the finding about a gain of the child's rotations about an axis, or None.
+    """Return the finding about a wrong gain of the child's rotations about an axis, or None.
 
-    ``axes`` (3, 3) has the principal axes of rotation in its columns, in the parent sensor's frame,
-    the main axis first.
+    ``axes`` (3, 3) has the principal axes of rotation as columns, in the parent sensor's frame. The
+    main axis is the first column.
     """
     gains, sigmas = slow.fit("gain")
     biases = slow.biases("gain")
     limits = LIMITS["rotation_gain"]
     noise = np.maximum(limits.sigmas * sigmas, BIASES * biases)
     ratios = np.abs(gains) / np.maximum(noise, limits.note)
-    # A bias is in inverse proportion to the squared rotation about its axis. Axes with too little
-    # rotation, compared with the main axis (the first), are skipped.
+    # The bias is in inverse proportion to the mean square rotation about its axis. Skip axes with
+    # too little rotation, compared with the main axis (the first).
     ratios = np.where(biases < biases[0] / _MIN_ROTATION_SHARE**2, ratios, 0.0)
     k = int(np.argmax(ratios))
     if ratios[k] < 1.0:
@@ -311,7 +315,7 @@ def _turned_world(slow: Regression, stream: str) -> Finding | None:
 
 
 class _Deviation(NamedTuple):
-    """Deviation of the value on one of three axes from the mean on the other two axes."""
+    """The axis whose value deviates most from the mean of the values on the two other axes."""
 
     axis: int
     size: float
@@ -319,7 +323,7 @@ class _Deviation(NamedTuple):
 
 
 def largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
-    """Return the most significant deviation among values (3,) that should be equal on all axes.
+    """Return the axis whose value deviates most significantly from the two other values (3,).
 
     ``sigmas`` (3,) are the standard deviations of the values.
     """
@@ -337,9 +341,9 @@ def largest_deviation(values: FloatArray, sigmas: FloatArray) -> _Deviation:
 
 
 def axis_gain(slow: Regression, stream: str) -> Finding | None:
-    """Return the finding about a coordinate with another scale than the others, or None.
+    """Return the finding that one coordinate has another scale than the other two, or None.
 
-    ``stream`` is "parent" or "child": the stream with this coordinate.
+    ``stream`` ("parent" or "child") has this coordinate.
     """
     group = f"axes_{stream}"
     gain = largest_deviation(*slow.fit(group))
@@ -359,7 +363,7 @@ def axis_gain(slow: Regression, stream: str) -> Finding | None:
 
 
 def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
-    """Return the finding about a mount that has moved, or None if the change is not significant.
+    """Return the finding that the mount has moved, or None if the change is not significant.
 
     ``start_ns`` is the first stamp of the recording.
     """
@@ -369,10 +373,10 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
     significant = np.where(np.abs(change.xi) > 2.0 * sigmas, change.xi, 0.0)
     moved_m = float(np.linalg.norm(significant[:3]))
     moved_rad = float(np.linalg.norm(significant[3:]))
-    # A rotation (rad) moves a place 1 m from the sensor by as many metres.
+    # A rotation by 1 rad moves a point 1 m from the sensor by about 1 m.
     size = max(moved_m, moved_rad)
     if change.log_ratio < 2.0 * SIGNIFICANT:
-        # Too little evidence for an error.
+        # The evidence is too weak for an error.
         size = min(size, LIMITS["mount_moved"].error)
     sizes = []
     if moved_m > 0:
@@ -386,7 +390,7 @@ def moved_mount(change: MountChange, start_ns: int) -> Finding | None:
 def _world_drift(
     slow: Regression, pose_pairs: PosePairs, speed_m_s: float
 ) -> Finding | None:
-    """Return the finding about a child's world that moves in the parent's world, or None.
+    """Return the finding that the child's world moves in the parent's world, or None.
 
     The drift is graded as a share of the usual speed of the sensors, ``speed_m_s``.
     """
@@ -408,7 +412,7 @@ def _world_drift(
 
 @dataclass(frozen=True)
 class _Delay:
-    """Delay of some quantities of a stream after its other quantities.
+    """Delay of some quantities of a stream, such as its positions, after its other quantities.
 
     Attributes
     ----------
@@ -419,7 +423,7 @@ class _Delay:
     size_s, sigma_s : float
         Delay and its standard deviation, s.
     speed_m_s : float
-        Usual speed of the sensor; of one coordinate, along its axis.
+        Usual speed of the sensor; for one coordinate, the usual speed along its axis.
     explained_share : float
         Share of the squared residuals that the delay explains.
     """
@@ -451,7 +455,7 @@ class _Delay:
         if self._is_always_error(shift_m):
             size_m = max(shift_m, _JUST_ABOVE * error_m)
         elif is_expected or is_minor:
-            # No error: shift and noise are scaled down, so that the shift is at most at the limit.
+            # Scale the shift and its noise down to the limit, so that the finding is no error.
             factor = min(1.0, error_m / max(shift_m, 1e-9))
             size_m = factor * shift_m
             sigma_m = factor * sigma_m
@@ -482,9 +486,10 @@ class _Delay:
 def delay_suspects(
     fast: Regression, pairs: PosePairs, speed_m_s: float, offset_s: float
 ) -> Iterator[Suspect]:
-    """Yield suspects for positions with a delay after the orientations of their stream.
+    """Yield suspects for positions that are later than the orientations of their stream.
 
-    The delay is that of all positions, or of the positions along one axis of the stream's world.
+    The delay is estimated for all positions, and for the positions along each axis of the stream's
+    world.
 
     Parameters
     ----------
@@ -511,7 +516,8 @@ def delay_suspects(
             speed_m_s=speed_m_s,
             explained_share=fast.explained_share(all_group, *smoothing),
         )
-        # An early coordinate is not reported: negative delays are skipped below.
+        # A coordinate that is earlier than the others has a negative delay here, and is skipped
+        # below.
         deviation = largest_deviation(*fast.fit(axis_group, *smoothing))
         late_axis = _Delay(
             code="axis_lag",
@@ -534,10 +540,10 @@ def delay_suspects(
 def smoothing_suspects(
     fast: Regression, interval_s: float, speed_m_s: float
 ) -> Iterator[Suspect]:
-    """Yield suspects for positions or orientations that are smoothed, while the other are not.
+    """Yield suspects for a stream in which either the positions or the orientations are smoothed.
 
-    A smoothing is an error by the distance that it displaces poses, and a warning by its time at
-    the usual speed.
+    The displacement of the poses decides whether smoothing is an error. Its time constant times the
+    usual speed decides whether it is a warning.
 
     Parameters
     ----------

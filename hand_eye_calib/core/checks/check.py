@@ -1,4 +1,4 @@
-"""Check whether two streams can be of sensors on one rigid body, and name their fault if not.
+"""Check whether both sensors can be on one rigid body; name the fault if they cannot.
 
 1. Check each stream alone (:mod:`~hand_eye_calib.core.checks.streams`).
 2. Correlate the angular rates (:mod:`~hand_eye_calib.core.alignment.time_offset`): do they agree at
@@ -10,8 +10,8 @@
 5. Search for copied streams and for small faults that bias the extrinsic
    (:mod:`~hand_eye_calib.core.checks.independence`, :mod:`~hand_eye_calib.core.checks.agreement`).
 
-Both streams may hold poses (of the sensor in its world) or inverse poses. An interpretation of both
-streams is called a *reading*.
+The poses of a stream are those of the sensor in its world, or the inverse poses. A *reading* is an
+assumption about both streams: poses or inverse poses.
 """
 
 from collections.abc import Callable, Sequence
@@ -88,18 +88,19 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 
 # Accuracy of the coarse clock offset of slow streams, in intervals between poses.
 _COARSE_INTERVALS = 0.5
-# Longest gap to interpolate across if the clocks of slow streams differ by more, in intervals.
+# Longest gap that is interpolated, in intervals between poses, if the clocks of slow streams differ
+# by more than the coarse accuracy.
 _SLOW_GAP_INTERVALS = 1.5
 
-# Standard deviations that are subtracted from a lever arm, for its smallest possible length.
+# The smallest possible lever arm is its estimate minus this number of standard deviations.
 _LEVER_ARM_SIGMAS = 3.0
 
-# Largest number of motions over some seconds, for the regression on small faults.
+# Largest number of motions over some seconds in the regression on small faults.
 MAX_MOTIONS = 1500
 
 # Shortest duration of both streams of a live session before they are checked.
 MIN_DURATION_S = 20.0
-# Smallest rotation of a sensor from its first pose before that.
+# Smallest rotation of a sensor from its first pose before a live session is checked.
 MIN_ROTATION_RAD = float(np.radians(30.0))
 
 
@@ -116,10 +117,12 @@ class CheckResult:
         explains the streams.
     offset : TimeOffset or None
         Clock offset in addition to the ``time_offset_s`` of the check; None without a fit.
-    readings : Readings or None
+    Two readings that fit about equally well, if the chosen reading may be wrong; otherwise None.
+    The second reading also inverts both streams.
         Two readings that fit about equally well, if the reading of the findings may be wrong. The
         other reading also inverts both streams.
-    open_covariance : (6, 6) array
+    Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad. It covers faults
+    that the streams neither prove nor exclude, and is part of the allowance of a checked result.
         Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, for faults that
         the streams neither prove nor exclude. It is part of the allowance of a checked result.
     """
@@ -152,17 +155,18 @@ def check_streams(
         Seconds to add to the child's stamps, and factor of its lengths, before the check.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
-    correlate : callable, optional
+    Function that correlates the angular rates of the original streams. It is called only if needed.
         Correlate the angular rates of the original streams. Called only if needed.
     earlier : ExtrinsicEstimate, optional
         Extrinsic from an earlier solve of these streams.
-    are_exact : bool
+    Whether the user declared both streams as exact. Exact streams need not drift apart.
         Whether the user called both streams exact. Exact streams need not drift apart.
     """
     original = StreamPair(parent, child.scaled(scale), max_gap_s)
     findings = check_stream(original.parent, "parent", max_gap_s)
     findings += check_stream(original.child, "child", max_gap_s)
-    # Rounded positions are judged later, when the unit of length is known.
+    # Rounded positions are judged later, because the limit is in metres and the unit of length is
+    # not yet determined.
     if _are_unusable([found for found in findings if found.code != ROUNDED]):
         return CheckResult(gravest_first(findings))
     streams = original.shifted(time_offset_s)
@@ -201,7 +205,7 @@ def check_streams(
 class _Arguments(NamedTuple):
     """Arguments of :func:`check_streams`.
 
-    ``original`` is both streams without the time offset; the child is multiplied by ``scale``.
+    ``original`` has both streams without the time offset, and the child's lengths times ``scale``.
     """
 
     original: StreamPair
@@ -217,7 +221,7 @@ def _are_unusable(findings: Sequence[Finding]) -> bool:
 
 
 def _factor_of_angles(correlation: Correlation) -> Finding | None:
-    """Return the finding that one factor is wrong in all rotations of the child, or None."""
+    """Return the finding that all rotation angles of the child are wrong by one factor, or None."""
     if 1.0 - correlation.correlation >= HOLDS:
         return None
     ratio = correlation.ratio
@@ -230,7 +234,7 @@ def _coarse_offset(
     added_s: float,
     correlation: Correlation,
 ) -> tuple[StreamPair, TimeOffset]:
-    """Return the streams to compare, and the remaining clock offset by their angular rates.
+    """Return the streams to compare, and the clock offset that their angular rates still have.
 
     Parameters
     ----------
@@ -250,7 +254,8 @@ def _coarse_offset(
             correlation, offset_s=correlation.offset_s - added_s
         )
     if not correlation.is_clear:
-        # A short recording may not reveal the offset. The streams may still agree with added_s.
+        # A short recording may not determine the offset. The streams may still agree with
+        # ``added_s``.
         remaining = replace(remaining, offset_s=0.0)
     return streams, TimeOffset(remaining.offset_s, correlation=remaining)
 
@@ -262,7 +267,7 @@ def _check_explained(
     findings: list[Finding],
     arguments: _Arguments,
 ) -> CheckResult:
-    """Check the remaining faults of streams that a hypothesis explains.
+    """Check streams that agree under a hypothesis for further faults.
 
     Parameters
     ----------
@@ -270,7 +275,7 @@ def _check_explained(
         Streams with the time offset of the arguments.
     explanation : Explanation
     coarse_offset : TimeOffset
-        Remaining clock offset.
+        Clock offset that remains in ``streams``.
     findings : list of Finding
         Findings of earlier checks.
     arguments : _Arguments
@@ -282,11 +287,13 @@ def _check_explained(
         corrected, explanation, offset.fit, arguments.scale
     )
     lengths = _lengths_of_explained(streams, corrected, fit, explanation)
-    # Findings of an unclear reading: either both streams hold inverse poses, or none does.
+    # If the reading is unclear, add its findings: both streams may contain inverse poses, or
+    # neither.
     of_reading = explanation.findings if explanation.may_be_uninverted else ()
     readings = explanation.readings
     if readings and lengths:
-        # Noise and shape decide between the readings only if the unit of length is known.
+        # The noise and the shape of the motion can compare the readings only in a known unit of
+        # length.
         readings = None
         findings = [found for found in findings if found not in of_reading]
     findings = in_metres(findings, [*lengths, *sizes], arguments.scale)
@@ -320,15 +327,15 @@ def _lengths_of_explained(
     fit: SimilarityFit,
     explanation: Explanation,
 ) -> list[Finding]:
-    """Return the finding about lengths or speeds that no vehicle has, or none.
+    """Return the findings about lengths or speeds that no vehicle has.
 
     ``fit`` is that of the corrected streams.
     """
     lever_arm_m = least_lever_arm(fit.T_parent_child, fit.sigmas[:3])
     lengths = check_lengths(corrected.parent, corrected.child, lever_arm_m)
     if lengths and explanation.may_be_uninverted and explanation.findings:
-        # If both streams hold inverse poses, the lever arm is the distance between the worlds. So
-        # the uncorrected streams are judged without a lever arm.
+        # If both streams contain inverse poses, the fitted lever arm is the distance between the
+        # worlds. Judge the uncorrected streams without a lever arm in this case.
         return check_lengths(streams.parent, streams.child)
     return lengths
 
@@ -341,11 +348,11 @@ def _preferred_reading(
     offset: TimeOffset,
     earlier: ExtrinsicEstimate | None,
 ) -> tuple[StreamPair, SimilarityFit]:
-    """Return the streams in the reading of an earlier extrinsic, and their fit.
+    """Return the streams in the reading that an earlier solve used, and their fit.
 
-    The earlier extrinsic was solved from streams that were not inverted. If the explanation inverts
-    both streams, although they may also be right without inversion, the uninverted streams are
-    fitted. Otherwise ``corrected`` and ``fit`` are returned.
+    The earlier solve did not invert the streams. If the explanation inverts both streams, but the
+    streams may also be right without inversion, fit the uninverted streams. Otherwise return
+    ``corrected`` and ``fit``.
     """
     has_other_reading = (
         explanation.may_be_uninverted
@@ -361,13 +368,13 @@ def _preferred_reading(
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
-    """Return the smallest length (m) of a lever arm within its uncertainty.
+    """Return the smallest length (m) of a lever arm within its standard deviations.
 
     Parameters
     ----------
     T_parent_child : (4, 4) array
     sigmas : (3,) array
-        Standard deviations of its translation, m.
+        Standard deviations of the translation, m.
     """
     sizes = (
         np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
@@ -380,10 +387,10 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
 def _explain_by_extrinsic(
     streams: StreamPair, X: FloatArray
 ) -> tuple[Explanation | None, TimeOffset]:
-    """Return the explanation that the streams agree without a mistake, and their clock offset.
+    """Return the explanation without mistakes if it holds, or None, and the clock offset.
 
-    The fit starts at an earlier extrinsic X (4, 4). The explanation is None unless the streams
-    clearly agree, in one unit of length and on about one clock.
+    The fit starts at the extrinsic X (4, 4) of an earlier solve. The streams must clearly agree, in
+    one unit of length and on about one clock; otherwise the explanation is None.
     """
     note_s = LIMITS["time_offset"].note
     error_s = LIMITS["time_offset"].error
@@ -394,7 +401,7 @@ def _explain_by_extrinsic(
         streams.child,
         TimeOffset(),
         streams.max_gap_s,
-        # One step of refinement suffices if the offset is below half of the reported size.
+        # One refinement suffices if the offset is below half of the smallest reported size.
         2.0 * note_s,
         X,
         HOLDS,
@@ -422,9 +429,9 @@ def _fine_offset(
 ) -> TimeOffset:
     """Return the refined clock offset of corrected streams.
 
-    ``fit`` is used if the coarse offset has no fit. A coarse offset with a fit, clearly below the
-    size that is reported, is not refined. Slow streams cannot be interpolated, so their offset is
-    good to one interval between poses.
+    ``fit`` is used if the coarse offset has no fit of its own. If a coarse offset with a fit is
+    clearly below the smallest reported size, it is not refined. Slow streams cannot be
+    interpolated: their offset is accurate to one interval between poses.
     """
     note_s = LIMITS["time_offset"].note
     if (
@@ -453,10 +460,11 @@ def _align_slow(
     added_s: float,
     correlation: Correlation,
 ) -> tuple[StreamPair, Correlation]:
-    """Return slow streams on one clock, and the correlation with the remaining clock offset.
+    """Return slow streams on one clock, with the correlation at the clock offset that remains.
 
-    Poses of slow streams are too far apart to interpolate. So the streams shifted by ``added_s`` or
-    the original streams are used, if they have common stamps and the coarse offset agrees.
+    The poses of slow streams are too far apart to interpolate. Therefore only two pairs of streams
+    are possible: those shifted by ``added_s``, or the original streams. A pair is used if it has
+    common stamps and the coarse offset agrees.
     """
     for offset_s, candidate in ((added_s, shifted), (0.0, original)):
         if len(candidate.synchronised) <= MIN_PAIRS:
@@ -479,7 +487,7 @@ def _explain_or_misread(
     earlier: ExtrinsicEstimate | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
-    """Return the explanation of both streams, or None, and the findings about misread streams.
+    """Return the explanation of both streams or None, and the findings about misread streams.
 
     ``aligned`` are ``streams``, shifted by the coarse offset.
     """
@@ -501,9 +509,9 @@ def _explain(
     start: FloatArray | None,
     is_frozen: bool,
 ) -> tuple[Explanation | None, list[Finding]]:
-    """Return the explanation of both streams, or None, and the findings about the streams.
+    """Return the explanation of both streams or None, and the findings about both streams.
 
-    ``start`` (4, 4) is an earlier extrinsic, if any: the first guess of the fits.
+    The fits start at ``start`` (4, 4), an earlier extrinsic, if there is one.
     """
     try:
         explanation = hypotheses.explain(streams, correlation.is_clear, start)
@@ -519,7 +527,7 @@ def _explain(
                 pairs, _motions(pairs, MAX_MOTIONS)
             )
             return None, coordinates or [*explanation.findings]
-    # The angular rates of a frozen stream are no evidence.
+    # Angular rates of a frozen stream contain no evidence about the offset.
     if is_frozen:
         return None, []
     if correlation.variation < MIN_VARIATION:
@@ -533,11 +541,10 @@ def _check_sizes(
     timed: SimilarityFit | None,
     used_scale: float,
 ) -> tuple[list[Finding], SimilarityFit]:
-    """Return findings about scale and unobservable axes of streams that agree, and the fit.
+    """Return the fit, and the findings about scale and unobservable axes, of streams that agree.
 
-    The fit includes the scale if the unit of length is unclear. ``timed`` is the fit with the
-    refined time offset, if any. The child's lengths in ``streams`` are the original lengths times
-    ``used_scale``.
+    The scale is fitted if the unit of length is unclear. ``timed`` is the fit at the refined time
+    offset, if there is one. ``used_scale`` is the factor that the child's lengths already contain.
     """
     pose_pairs = streams.synchronised
     motions = _motions(pose_pairs, MAX_PAIRS)
@@ -571,7 +578,7 @@ def _check_agreeing(
     offset: TimeOffset,
     arguments: _Arguments,
 ) -> Agreement:
-    """Check streams that agree for copies, faults that bias X, and fusion.
+    """Check agreeing streams for copies, for faults that bias X, and for fusion.
 
     ``corrected`` are the streams on one clock, with all mistakes undone.
     """
@@ -611,15 +618,15 @@ def check_parts(
 ) -> list[Finding]:
     """Check two streams on one clock, if at least one stream has no full poses.
 
-    The checks need no solve: rounding, lengths, frozen poses. ``lever_arm_m`` is the smallest
-    possible distance of the sensors (m) by an earlier solve; 0 without a solve.
+    Nothing is solved here: rounding, lengths and frozen poses are checked. ``lever_arm_m`` is a
+    lower limit of the distance between the sensors (m) from an earlier solve; 0 without a solve.
     """
     if not (parent.has_positions and child.has_positions):
         parent = parent.scaled(0.0)
         child = child.scaled(0.0)
     findings = check_positions(parent, "parent", max_gap_s)
     findings += check_positions(child, "child", max_gap_s)
-    # Rounded positions stay the same while the sensor moves.
+    # Rounded positions repeat although the sensor moves, so they would count as frozen.
     is_rounded = any(found.code == ROUNDED for found in findings)
     if is_rounded or _are_unusable(findings):
         return findings
@@ -647,5 +654,5 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
 def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:
     """Return motions over the first lag of ``LAGS_S`` with enough motions."""
     motions = (pairs_over(pose_pairs, lag_s, max_motions) for lag_s in LAGS_S)
-    # Streams that agree were fitted over the first lag with enough motions, so it exists.
+    # The streams were fitted over the first lag with enough motions, so this lag exists.
     return next(pairs for pairs in motions if len(pairs) >= MIN_PAIRS)

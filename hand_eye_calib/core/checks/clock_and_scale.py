@@ -12,16 +12,16 @@ from hand_eye_calib.core.checks.findings import Finding, finding, graded
 from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.checks.units import in_other_units
 
-# Code of rounded positions, whose severity depends on the unit of length.
+# Code of the finding about rounded positions. Its severity depends on the unit of length.
 ROUNDED = "coarse_positions"
-# Largest clock offset (s) that counts as none: half of the last printed digit of milliseconds.
+# A smaller clock offset (s) is printed as none: half of the last digit, in milliseconds.
 _NO_OFFSET_S = 0.0005
 
 
 def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
-    """Return the finding about a clock offset, or none.
+    """Return the finding about a clock offset, or an empty list.
 
-    ``added_s`` was added to the child's stamps before, s.
+    ``added_s`` (s) was already added to the child's stamps.
     """
     values = offset_values(offset.seconds, added_s) | {
         "sigma_s": offset.sigma_s
@@ -45,14 +45,14 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
 
 
 def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:
-    """Return the values of the finding about a clock offset ``offset_s`` beyond ``added_s``."""
+    """Return the values of a finding about a clock offset: ``added_s`` plus ``offset_s`` (s)."""
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
     return values | {"total_s": round(added_s + offset_s, 4)}
 
 
 def check_model_scale(scale: float, sigma: float) -> list[Finding]:
-    """Return the finding about a scale that the noise model added to the solution, or none.
+    """Return the finding about the scale in the solution of the noise model, or an empty list.
 
     Parameters
     ----------
@@ -80,9 +80,10 @@ def check_model_scale(scale: float, sigma: float) -> list[Finding]:
 def own_unit(
     streams: StreamPair, fit: SimilarityFit, used_scale: float
 ) -> Finding | None:
-    """Return the finding that the child has another unit of length, or else another scale.
+    """Return the finding that the child has another unit of length or another scale, or None.
 
-    None if the scale is near 1. The child's lengths are the original lengths times ``used_scale``.
+    The result is None if the scale is near 1. The child's lengths already contain the factor
+    ``used_scale``.
     """
     original_child = streams.child.scaled(1.0 / used_scale)
     sigma_and_bias = float(np.hypot(fit.scale_sigma, fit.scale_bias))
@@ -105,14 +106,14 @@ def own_unit(
 def in_metres(
     findings: Sequence[Finding], units: Sequence[Finding], scale: float
 ) -> list[Finding]:
-    """Return the findings, with those about rounded positions graded in metres.
+    """Return the findings, with rounded positions graded by the rounding in metres.
 
     Parameters
     ----------
     findings : sequence of Finding
         Findings about streams with the child's lengths multiplied by ``scale``.
     units : sequence of Finding
-        Findings about the unit of a stream's lengths; their options convert it to metres.
+        Findings about the unit of length of a stream. Their options convert its lengths to metres.
     scale : float
     """
     options: dict[str, Any] = {}
