@@ -1,8 +1,8 @@
 """Regression of the motion between two streams on possible faults.
 
-Two sensors move together on one rigid body. A and B are the motions of parent and child over a
-span of time, both in the parent's axes (the child's rotated by R_X); a and b are their
-displacements, t is the lever arm. A fault k of size f_k changes the motion by ``c_k f_k``:
+Two sensors move together on one rigid body. A and B are the motions of parent and child over a span
+of time, both in the parent's axes (B is rotated by R_X). a and b are their displacements, and t is
+the lever arm. A fault k of size f_k changes the motion by ``c_k f_k``:
 
     b - a = (R_A - I) t + sum_k c_k f_k + noise,        Log(R_B R_A') = sum_k c_k f_k + noise.
 
@@ -11,7 +11,7 @@ Words of this module:
 - A *regressor* c_k is the displacement (m) and the rotation (rad) that a fault of size 1 causes.
 - The *coefficient* of a regressor is the estimated size of the fault.
 - A *group* is the regressors of one fault, such as its three axes.
-- The *base* is the groups that every fit contains: the lever arm, a small rotation of X, the scale.
+- The *base* is the set of groups in every fit: the lever arm, a small rotation of X, the scale.
 
 Motions over some seconds reveal gains, scales by axis, and worlds that are turned or moving.
 Motions over a second reveal delays d and smoothing c. They change a motion of angular frequency f
@@ -51,16 +51,18 @@ _MIN_STEP_S = 0.05
 # Stamps are regular if they deviate from multiples of a step by less than this share of a step.
 _MAX_STAMP_ERROR = 0.3
 
-# Residual length at which the robust weight of a motion is a quarter, in standard deviations.
+# A motion whose residual has this length, in standard deviations, gets a quarter of the full
+# weight.
 _QUARTER_WEIGHT_SIGMAS = 3.0
-# Rounds of robust weights.
+# Number of rounds in which the robust weights are computed.
 ROUNDS = 4
 
-# Smallest units of displacements (m) and rotations (rad), for streams without noise.
+# Smallest standard deviation of displacements (m), for streams without noise.
 _MIN_UNIT_M = 1e-7
+# Smallest standard deviation of rotations (rad), for streams without noise.
 _MIN_UNIT_RAD = 1e-8
 
-# Group of the base that another group replaces: scales by axis contain the scale.
+# Group of the base that is left out if the key is fitted: scales by axis contain the scale.
 _REPLACED = {"axes_child": "scale", "axes_parent": "scale"}
 
 # Regressors (K, 6, m) of K motions, by the name of their group.
@@ -78,7 +80,7 @@ class Regression:
     instruments : (K, 6, p + 1) array
         Instruments of the columns. Regressors without an instrument are their own.
     units : (6, 1) array
-        Standard deviations of the noise, m and rad. Rows are divided by them.
+        Standard deviations of the noise, in m and rad. The rows were divided by them.
     columns : mapping
         Columns of the regressors of each group.
     base : sequence of str
@@ -117,7 +119,7 @@ class Regression:
             weights = robust_weights("geman_mcclure", squared)
         self._total_weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
-        # Weighted products of all columns (p + 1, p + 1).
+        # Products of all columns, summed with the weights, (p + 1, p + 1).
         self._products = flat.T @ weighted.reshape(flat.shape)
         self._blocks = Blocks.of_rows(weighted, BLOCKS, instruments / units)
 
@@ -128,12 +130,12 @@ class Regression:
     def _columns_beside(
         self, group: str, nuisances: tuple[str, ...]
     ) -> list[int]:
-        """Return the columns that are fitted together with a group: its base and nuisances."""
+        """Return the columns of the base and the nuisances, which are fitted with a group."""
         base = [name for name in self._base if name != _REPLACED.get(group)]
         return self._columns_of([*base, *nuisances])
 
     def biases(self, group: str) -> FloatArray:
-        """Return the bias (m,) that noise of the regressors can cause in coefficients of a group.
+        """Return the largest bias (m,) of a group's coefficients by noise of the regressors.
 
         The noise of the regressors is assumed to be as large as the noise of the residuals.
         """
@@ -142,13 +144,13 @@ class Regression:
         return self._sigma**2 * self._total_weight / squares
 
     def displacements_m(self, group: str) -> FloatArray:
-        """Return the root mean square displacement (m,) that each fault of size 1 causes."""
+        """Return the root mean square displacement (m,) that each fault causes if its size is 1."""
         return self._displacements_m[self._columns[group]]
 
     def response(self, group: str) -> FloatArray:
-        """Return the change (6, m) of X that each fault of size 1 causes if it is not estimated.
+        """Return the change (6, m) of X that each fault of size 1 causes if the fit omits it.
 
-        It is a change of the lever arm (m) and a rotation vector (rad), in the parent's axes.
+        The change has the lever arm (m) and a rotation vector (rad), in the parent's axes.
         """
         of_extrinsic = self._columns_of(["lever", "rotation"])
         information = self._products[np.ix_(of_extrinsic, of_extrinsic)]
@@ -160,7 +162,7 @@ class Regression:
     def explained_share(self, group: str, *nuisances: str) -> float:
         """Return the share (0 to 1) of the squared residuals that a group explains.
 
-        The base and the groups ``nuisances`` are fitted before and together with the group.
+        The base and the groups ``nuisances`` are part of both fits: without and with the group.
         """
         beside = self._columns_beside(group, nuisances)
         costs = []
@@ -177,8 +179,8 @@ class Regression:
         """
         beside = self._columns_beside(group, nuisances)
         columns = [*beside, *self._columns[group]]
-        # The larger jackknife variance with long and with short blocks: errors may be correlated
-        # for longer than a short block.
+        # Use the larger jackknife variance of long and short blocks: errors may be correlated for
+        # longer than a short block.
         variances = np.maximum(
             np.diag(self._blocks.jackknife(columns)),
             np.diag(self._blocks.merged(BLOCKS // 2).jackknife(columns)),
@@ -210,7 +212,7 @@ class _Stream:
     rotations : (K, 3, 3) array
         Rotations from start to end, in the axes at the start.
     displacements_in_world, displacements : (K, 3) arrays
-        Displacements from start to end (m), in the stream's world and in the axes at the middle.
+        Displacements from start to end (m): in the stream's world, and in the axes at the middle.
     """
 
     def __init__(
@@ -236,9 +238,9 @@ class _Stream:
         )
 
     def start_minus_end(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (N, 3) at the start minus those at the end, in the axes at the start.
+        """Return vectors (N, 3) at the start minus vectors at the end, in the axes at the start.
 
-        The vectors are in the parent's axes at their pose.
+        The vectors at a pose are in the parent's axes at that pose.
         """
         start, _, end = self.rows
         return vectors[start] - se3.times(self.rotations, vectors[end])
@@ -286,7 +288,7 @@ def motion_regression(
     child = _Stream(
         pose_pairs.Ts_cw_c, motions, se3.rotation_of(T_parent_child)
     )
-    # Displacements of each stream in its own world, predicted from the other stream.
+    # Displacements of each stream in its own world, predicted from the motion of the other stream.
     arm = se3.times(parent.chords, se3.translation_of(T_parent_child))
     parent_to_world = np.swapaxes(parent.from_world, 1, 2)
     child_to_world = np.swapaxes(child.from_world, 1, 2)
@@ -337,7 +339,7 @@ def motion_regression(
 def delay_regression(
     pose_pairs: PosePairs, motions: MotionPairs, T_parent_child: FloatArray
 ) -> Regression | None:
-    """Return the regression of motions over about a second; None if too few stamps are regular.
+    """Return the regression of motions over one second; None if too few stamps are regular.
 
     Notes
     -----
@@ -376,7 +378,7 @@ def delay_regression(
     parent = _Stream(Ts_parent, motions, np.eye(3))
     child = _Stream(Ts_child, motions, R_X)
     groups = _filter_groups(parent, child, lever_arm, around, step_s)
-    # The same regressors from poses of each sensor that are computed from the other stream.
+    # The same regressors, from poses of each sensor that are predicted from the other sensor.
     parent_of_child = _Stream(Ts_child @ se3.inverse(X), motions, np.eye(3))
     child_of_parent = _Stream(Ts_parent @ X, motions, R_X)
     from_other = _filter_groups(
@@ -397,7 +399,8 @@ def _filter_groups(
 ) -> dict[str, FloatArray]:
     """Return the groups of delays and smoothing, and "late": a delay of whole poses of the child.
 
-    ``lever_arm`` (3,) is that of X, m. ``around`` and ``step_s`` (s) define the differences.
+    ``lever_arm`` (3,) is the lever arm of X, m. ``around`` is the stencil of the differences, and
+    ``step_s`` (s) its step.
     """
     groups = {}
     for name, sign, stream in (("child", -1.0, child), ("parent", 1.0, parent)):
@@ -408,7 +411,7 @@ def _filter_groups(
         acceleration_change = sign * (acceleration[start] - acceleration[end])
         late = se3.times(stream.from_world, velocity_change)
         positions = se3.times(stream.from_world, acceleration_change)
-        # The orientation of the middle pose rotates the displacement.
+        # Smoothing changes the orientation of the middle pose, which rotates the displacement.
         orientations = sign * se3.cross(
             angular_acceleration[middle], stream.displacements
         )
@@ -418,7 +421,7 @@ def _filter_groups(
                 displaced, stream.start_minus_end(rate)
             )
         else:
-            # The parent's orientations at both ends rotate the lever arm.
+            # It also changes the parent's orientations at both ends, which rotate the lever arm.
             at_start = se3.cross(angular_acceleration[start], lever_arm)
             at_end = se3.cross(angular_acceleration[end], lever_arm)
             orientations += se3.times(stream.R_start, at_start) - se3.times(
@@ -435,7 +438,7 @@ def _filter_groups(
 
 
 def noise_units(displacements: FloatArray, rotations: FloatArray) -> FloatArray:
-    """Return the standard deviations (6,) of residuals: displacements (K, 3), rotations (K, 3)."""
+    """Return the standard deviations (6,) of displacements (K, 3) and rotations (K, 3)."""
     unit_m = max(float(robust_sigma(displacements)), _MIN_UNIT_M)
     unit_rad = max(float(robust_sigma(rotations)), _MIN_UNIT_RAD)
     return np.repeat([unit_m, unit_rad], 3)
@@ -455,10 +458,10 @@ def _base_groups(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
 def _regressors(
     of_displacement: FloatArray, of_rotation: FloatArray | None = None
 ) -> FloatArray:
-    """Join regressors of displacements and of rotations to (K, 6, m).
+    """Join regressors of displacements and of rotations into one array (K, 6, m).
 
-    Each part is (K, 3, m), or (K, 3) for one regressor. A fault without rotations has only the
-    first part.
+    Each argument is (K, 3, m), or (K, 3) for a single regressor. A fault that causes no rotations
+    has displacements only.
     """
     if of_rotation is None:
         of_rotation = np.zeros_like(of_displacement)
@@ -476,8 +479,8 @@ def _regression(
 ) -> Regression:
     """Return the regression on groups of faults and on the base.
 
-    The lever arm has instruments from the child's orientations; ``instruments`` are those of
-    other groups. ``also_in_base`` names groups that join the base.
+    The lever arm has instruments from the child's orientations; ``instruments`` are for the other
+    groups. ``also_in_base`` names groups that become part of the base.
     """
     displaced = child.displacements - parent.displacements
     turned = se3.rotation_log(

@@ -1,4 +1,4 @@
-"""Findings of the stream checks: their texts by a key, and their severity by size or options."""
+"""Findings of the stream checks: texts by key; severity by the size of the fault or by options."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -33,21 +33,21 @@ __all__ = [
     "unobservable_axes",
 ]
 
-# Jumps up to this share of the steps hardly affect the methods that reject outliers.
+# Jumps in at most this share of the steps hardly affect methods that reject outliers.
 _FEW_JUMPS = 0.02
 
 _NEVER = float("inf")
 
 
 class Limits(NamedTuple):
-    """Limits of the size of a fault, which determine its severity.
+    """Limits of the size of a fault. They determine the severity of its finding.
 
     Attributes
     ----------
     sigmas : float
-        Smallest size of the fault in standard deviations.
+        Smallest size in standard deviations.
     note, warning, error : float
-        Smallest size of a note, of a warning and of an error.
+        Smallest size for a note, a warning and an error, in the unit of the fault.
     """
 
     sigmas: float
@@ -56,50 +56,54 @@ class Limits(NamedTuple):
     error: float
 
 
-# Sizes are at least half of what changes an extrinsic by 1 cm or 0.5 deg.
+# Each limit is at least half of the fault that changes an extrinsic by 1 cm or 0.5 deg.
 LIMITS = {
-    # Seconds.
+    # Clock offset, s.
     "time_offset": Limits(5.0, 0.005, 0.01, 0.1),
-    # Factor, less 1. The fit has tested its significance.
+    # Scale minus 1. The significance was already tested by the fit.
     "scale": Limits(0.0, 0.01, 0.01, 0.03),
-    # Share of the steps.
+    # Jumps, as a share of the steps.
     "jumps": Limits(0.0, 0.002, 0.002, _NEVER),
-    # Share of the time. A second or more is at least a note.
+    # Repeated poses, as a share of the time. A second or more is at least a note.
     "frozen": Limits(0.0, 1e-9, 0.02, 0.02),
-    # Metres.
+    # Rounding step, m.
     "coarse_positions": Limits(0.0, 0.002, 0.005, 0.02),
-    # Shift of positions, m. At constant speed a delay looks like a lever arm, so that fewer
-    # standard deviations suffice than for smoothing.
+    # Displacement of the positions by the delay, m. At constant speed a delay equals a lever arm,
+    # so that fewer standard deviations suffice than for smoothing.
     "late": Limits(4.5, 0.008, 0.008, 0.05),
-    # Shift of positions, m. The standard deviation does not contain the noise of the columns.
+    # Displacement of the positions by the smoothing, m. Its standard deviation does not contain the
+    # noise of the regressors.
     "smoothed": Limits(8.0, 0.008, 0.008, 0.02),
-    # Largest distance of a chord from its arc, m.
+    # Largest distance between the interpolated line and the true arc, m.
     "interpolated": Limits(0.0, 0.0, 0.0, 0.02),
-    # Size of a correction, m of a place 1 m from the sensor.
+    # Displacement of a point 1 m from the sensor by a correction, m.
     "propagated": Limits(0.0, 0.008, 0.008, 0.03),
-    # Shift of positions by the scatter of the stamps, m. The scatter averages out for the most.
+    # Displacement of the positions by the scatter of the stamps, m. Most of the scatter averages
+    # out.
     "arrival": Limits(0.0, 0.008, 0.008, _NEVER),
-    # Factor, less 1.
+    # Gain of the rotations minus 1.
     "rotation_gain": Limits(6.0, 0.003, 0.003, 0.03),
-    # Factor of the rates about an axis of a sensor, less 1.
+    # Gain of the angular rates about an axis of the sensor, minus 1.
     "gain_of_axis": Limits(6.0, 0.003, 0.003, 0.03),
-    # Symmetric part of the matrix between the rates, rad: the error of the rotation is as large.
-    # The visual-inertial odometries of three tango devices differ by up to 0.016.
+    # Symmetric part of the matrix that maps the rates of one sensor to those of the other, rad. The
+    # rotation of X is wrong by about as much. The visual-inertial odometries of three Tango devices
+    # differ by up to 0.016.
     "misaligned": Limits(6.0, 0.004, 0.004, 0.0175),
-    # Logarithm of a factor that noise does not cause.
+    # Log ratio of the rotation angles of both streams.
     "turns": Limits(0.0, 0.4, 0.4, 0.4),
-    # Factor, less 1. Scales of odometries are accurate to 1 %; three recordings with scales of 0.9
-    # to 11 % were judged USE without this limit.
+    # Scale of the noise model, minus 1. Scales of odometries are accurate to 1 %. Without this
+    # limit, three recordings with scale errors of 0.9 to 11 % were judged USE.
     "model_scale": Limits(3.0, 0.01, 0.03, _NEVER),
-    # Factor, less 1.
+    # Scale of one axis minus 1.
     "axis_scale": Limits(6.0, 0.015, 0.015, 0.05),
-    # Radians.
+    # Angle between both worlds, rad.
     "worlds_turned": Limits(
         6.0, np.radians(0.5), np.radians(0.5), np.radians(1.5)
     ),
-    # Share of the speed: the error of the direction is half the usual target of a rotation.
+    # Drift as a share of the speed. An error of the direction by 0.003 rad is half of the usual
+    # target of a rotation.
     "world_drift": Limits(6.0, 0.003, 0.003, _NEVER),
-    # Metres, of a place up to 1 m from the sensor.
+    # Displacement of a point up to 1 m from the sensor, m.
     "mount_moved": Limits(0.0, 0.005, 0.005, 0.0175),
 }
 
@@ -112,7 +116,7 @@ def graded(
     Parameters
     ----------
     key : str
-        Key of its words and of its limits.
+        Key of the words and of the limits.
     stream : str
         "parent", "child" or "both".
     size, sigma : float
@@ -142,7 +146,7 @@ def finding(
     options: Mapping[str, float | str] | None = None,
     **values: Any,
 ) -> Finding:
-    """Return a finding with its values.
+    """Return a finding with the texts of a key and with measured values.
 
     Parameters
     ----------
@@ -151,11 +155,11 @@ def finding(
     stream : str
         "parent", "child" or "both".
     severity : Severity, optional
-        Severity in place of the usual one.
+        Severity that replaces the usual severity of the key.
     options : mapping, optional
         Options that repair the fault, by name.
     **values
-        Values that the words name, and other numbers that were measured.
+        Values that appear in the texts, and further measured numbers.
     """
     words = words_of(key)
     return Finding(
@@ -169,14 +173,14 @@ def finding(
 
 
 def _plain_value(value: Real | str) -> float | int | str:
-    """Convert a number of numpy to one of Python, which files can contain. Texts are unchanged."""
+    """Convert a NumPy number to a Python number, which files can contain. Texts are unchanged."""
     if isinstance(value, str):
         return value
     return int(value) if isinstance(value, Integral) else float(value)
 
 
-# Option (without the name of the stream) and its value that correct the convention of a stream, by
-# the code of the finding. Streams are corrected in this order.
+# Code of a finding, and the option with its value that corrects the convention of a stream. The
+# option is without the name of the stream. Streams are corrected in this order.
 CONVENTIONS = {
     "quaternion_order": ("quaternion", "wxyz"),
     "quaternion_names": ("quaternion", "yzwx"),
@@ -200,7 +204,7 @@ def conventions(code: str, stream: str) -> dict[str, float | str]:
 def repair_message(
     findings: Sequence[Finding], options: Options, verdicts: str = ""
 ) -> str:
-    """Return the message about repaired faults, the options that were set, and how to undo them.
+    """Return the message about repaired faults: the options that were set, and how to undo them.
 
     Parameters
     ----------
@@ -209,7 +213,7 @@ def repair_message(
     options : mapping
         Options that repair the faults, and their values.
     verdicts : str
-        Text about the verdicts with and without the repair.
+        Text about the verdicts before and after the repair.
     """
     faults = "; ".join([issue.what for issue in findings])
     used = options_in_words(options)
@@ -231,7 +235,7 @@ def unobservable_axes(axes: Sequence[str]) -> Finding:
 def _beside_priors(note: Finding, current: Options) -> Finding:
     """Return the note of :func:`unobservable_axes` for the axes that have no prior.
 
-    If all axes have a prior, the note says so. ``current`` are the options of the configuration.
+    If all axes have a prior, the note contains this fact. ``current`` are the options in use.
     """
     axes = [name.partition(".")[2] for name in note.options]
     without_prior = [axis for axis in axes if not current[f"prior.{axis}"]]
@@ -245,17 +249,16 @@ def answered(
 ) -> list[Finding]:
     """Return findings with the severity that they have under a configuration.
 
-    A finding becomes a note if the configuration has all options that repair the fault. A small
-    share of jumps becomes a note if the method rejects outliers. Axes that have a prior are not
-    called unknown.
+    A finding becomes a note if the configuration has all options that repair the fault. Few jumps
+    become a note if the method rejects outliers. Axes with a prior are not called unknown.
     """
     current = config.to_options()
     graded_findings = []
     for found in findings:
         options = dict(found.options)
         if found.code in CONVENTIONS:
-            # If a corrected stream needs the same correction again, it was right at first: the
-            # finding then proposes the default values of these options.
+            # A corrected stream that needs the same correction again was right before. The finding
+            # then proposes the default values of these options.
             repeated = [
                 name
                 for name, value in options.items()

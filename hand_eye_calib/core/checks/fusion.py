@@ -1,4 +1,4 @@
-"""Check that no filter corrects one stream by the other through an assumed mount.
+"""Check whether a filter corrects one stream by the other stream through an assumed mount.
 
 Example: a filter adds the steps of a camera's odometry, and pulls its poses towards those of a
 lidar. The pull uses an assumed extrinsic from a TF tree. Fast motions of the filtered stream then
@@ -35,25 +35,27 @@ from hand_eye_calib.core.pairing.motion_pairs import (
     pairs_over,
 )
 
-# Time constants T of the filters that are tried, s. A filter between two of them is detected by
-# both.
+# Time constants T (s) of the filters that are tried. A filter whose time constant is between two of
+# these values is detected with both.
 _TIME_CONSTANTS_S = (0.1, 0.3, 1.0, 3.0)
 # Largest number of motions whose differences are fitted.
 _MOST_MOTIONS = 3000
-# Blocks of the jackknife for the standard deviations, and the fewest motions in a block.
+# Number of blocks of the jackknife that estimates the standard deviations.
 _BLOCKS = 20
+# Fewest motions in a block.
 _MIN_MOTIONS_PER_BLOCK = 3
 
-# Limits of D: standard deviations of its rotation or its translation, and the share of the squared
-# residuals that D explains. Two sensors have at most 8.4 standard deviations (78 simulated and 33
-# real recordings).
+# D is significant if its rotation or its translation exceeds this number of standard deviations.
+# Measured for two sensors: at most 8.4 (78 simulated and 33 real recordings).
 _SIGMAS = 14.0
+# D must also explain this share of the squared residuals.
 _SHARE = 0.01
-# Smallest rotation (rad) and translation (m).
+# Smallest rotation (rad) of D that is reported.
 _LEAST_ROTATION_RAD = float(np.radians(0.3))
+# Smallest translation (m) of D that is reported.
 _LEAST_TRANSLATION_M = 0.01
-# Share above which a rotation is an error. D then explains the differences better than any other
-# fault.
+# A rotation that explains more than this share of the squared residuals is an error: D then
+# explains the differences better than any other fault could.
 _CERTAIN_SHARE = 0.35
 
 
@@ -68,7 +70,7 @@ class _Fit(NamedTuple):
         D, which leads from the assumed to the true mount: translation (m) and rotation vector
         (rad), in the child's axes.
     translation_sigmas, rotation_sigmas : float
-        Sizes of the translation and of the rotation of D, in their standard deviations.
+        Sizes of the translation and of the rotation of D, in standard deviations.
     share : float
         Share of the squared residuals that D explains.
     """
@@ -178,10 +180,10 @@ class _Regression(NamedTuple):
 
 
 class _Regressors:
-    """Changes of the motions of the child by errors of its poses.
+    """Changes of the child's motions that errors of the child's poses cause.
 
-    A regressor is the perturbation (6,) of a pose in the child's axes: translation before rotation.
-    The world of the poses does not matter.
+    A regressor is the change (6,) of a pose in the child's axes: translation before rotation. It
+    does not depend on the world of the poses.
 
     Parameters
     ----------
@@ -201,7 +203,7 @@ class _Regressors:
         pairs: MotionPairs,
     ) -> None:
         self._poses = poses.copy()
-        # A near origin avoids the rounding of map coordinates.
+        # Poses near the origin avoid rounding errors of map coordinates.
         self._poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
         self._T_parent_child = T_parent_child
         self._seconds = seconds
@@ -217,7 +219,7 @@ class _Regressors:
         return perturbations[self._end] - at_start
 
     def usual_errors(self) -> FloatArray:
-        """Return the regressors (K, 6, 10) of errors that have other causes than a filter.
+        """Return the regressors (K, 6, 10) of errors with other causes than a filter.
 
         The errors are an error of the extrinsic (6), a clock offset, a scale, a delay of the
         child's positions after its orientations, and the same delay of the parent.
@@ -251,13 +253,12 @@ class _Regressors:
         return np.concatenate([mount, of_motions], axis=2)
 
     def filtered(self, time_constant_s: float) -> FloatArray:
-        """Return the regressors (K, 6, 6) of D, the error of the assumed mount.
+        """Return the regressors (K, 6, 6) of D, the error of the assumed mount, for one filter.
 
-        The regressors are those for a filter with this time constant (s), which pulls one stream
-        towards the other.
+        The filter with the time constant (s) pulls one stream towards the other.
         """
         kept = np.exp(-median(np.diff(self._seconds)) / time_constant_s)
-        # The lower half of an adjoint repeats its rotation.
+        # An adjoint contains its rotation twice, so the upper half is sufficient.
         upper = self._adjoints[:, :3]
         steps = np.diff(upper, axis=0, prepend=upper[:1])
         high_passed = kept * _decaying_sums(steps, kept)
@@ -270,8 +271,8 @@ class _Regressors:
 def _decaying_sums(values: FloatArray, kept: float) -> FloatArray:
     """Return ``sums[n] = values[n] + kept * sums[n - 1]`` along the first axis (N, ...).
 
-    Each round doubles the number of values in a sum. ``scipy.signal`` takes longer to load than
-    this to compute.
+    Each round doubles the number of values in a sum. The import of ``scipy.signal`` would take
+    longer than this computation.
     """
     sums = values.copy()
     lag = 1
@@ -282,11 +283,12 @@ def _decaying_sums(values: FloatArray, kept: float) -> FloatArray:
 
 
 class _Differences:
-    """Differences between the motions of both streams, with regressors and instruments.
+    """Differences between the motions of both streams, with their regressors and instruments.
 
-    Regressors are computed from the parent's poses, and contain their noise. The differences
-    contain the same noise, which biases D. So the same regressors, computed from the child's poses,
-    are the instruments (W. Greene, *Econometric Analysis*, 2012, chapter 8).
+    The regressors are computed from the parent's poses. Both regressors and differences contain the
+    noise of these poses, and this common noise biases D. Therefore the same regressors, computed
+    from the child's poses, are the instruments (W. Greene, *Econometric Analysis*, 2012, chapter
+    8).
 
     Parameters
     ----------
@@ -321,7 +323,7 @@ class _Differences:
 
     @property
     def _n_usual(self) -> int:
-        """Number of regressors of errors that are no filter."""
+        """Number of regressors that do not belong to a filter."""
         return self._usual_errors.shape[2]
 
     def regression(self, time_constant_s: float) -> _Regression:
@@ -369,8 +371,8 @@ class _Differences:
     def _robust_weights(self, rows: FloatArray) -> FloatArray:
         """Return robust weights (K,) of motions with rows (K, 6, p + 1).
 
-        Normal equations are ten times faster here than the least squares of ``robust_regression``:
-        the rows are many, and few digits of the coefficients suffice for weights.
+        Normal equations are ten times faster here than the least squares of ``robust_regression``.
+        They suffice, because weights need few digits of the coefficients.
         """
         weights = np.ones(len(rows))
         for _ in range(ROUNDS):
@@ -394,14 +396,14 @@ def _table(rows: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _cost(table: FloatArray, columns: range) -> float:
-    """Return the squared residuals of the last column after a fit by other columns of a table."""
+    """Return the squared residuals of the last column of a table, fitted by other columns."""
     x = np.append(-solve(table, columns), 1.0)
     used = [*columns, -1]
     return float(x @ table[np.ix_(used, used)] @ x)
 
 
 def _in_sigmas(vector: FloatArray, covariance: FloatArray) -> float:
-    """Return the size of a vector (3,) in standard deviations of its covariance (3, 3)."""
-    # Directions without information have the variance 0, and do not count.
+    """Return the length of a vector (3,) in standard deviations, for its covariance (3, 3)."""
+    # Directions without information have variance 0 here. The pseudo-inverse ignores them.
     information = np.linalg.pinv(covariance, hermitian=True)
     return float(np.sqrt(vector @ information @ vector))

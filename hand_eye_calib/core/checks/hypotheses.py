@@ -1,4 +1,4 @@
-"""Hypotheses about mistakes in two streams, such as inverse poses or quaternions in another order.
+"""Search for usual mistakes in two streams, such as inverse poses or reordered quaternions.
 
 Model: a rigid mount X gives both sensors the same angle of rotation, and the same distance along
 the screw axis, in every motion pair (screw congruence). The robust fit of
@@ -53,22 +53,23 @@ from hand_eye_calib.core.pairing import motion_pairs
 
 # Largest number of motions in the rough fits that rank the hypotheses.
 _MAX_ROUGH = 120
-# A rival replaces another hypothesis if its unexplained share is smaller by this factor.
+# A hypothesis replaces another one if its unexplained share is smaller by this factor.
 _DECISIVE = 2.0
 
-# Largest unexplained share that noise can cause, in streams whose angular rates clearly agree.
+# Largest unexplained share that noise can cause if the angular rates of the streams clearly agree.
 _NOISY = 0.3
 
-# Two hypotheses are equally good if their unexplained shares differ by less than this factor. Then
-# the hypothesis with fewer mistakes is chosen, and a mistake of the child before one of the parent.
+# Two hypotheses fit equally well if their unexplained shares differ by less than this factor. The
+# hypothesis with fewer mistakes is then chosen, and a mistake of the child before a mistake of the
+# parent.
 _ABOUT_EQUAL = 1.5
 
-# Shape of the motion: the sum of the log ratios of the paths and of the lever arms. The shape of
-# 190 correct recordings (KinHEC, real, simulated) was -0.25 at most, and below -0.4 in all but six.
-# The shape of inverse streams has the other sign.
-# Above this shape the streams may be inverse, so that both readings are kept.
+# The streams may be inverse if the shape of the motion exceeds this limit; both readings are then
+# kept. The shape is the sum of two log ratios: of the paths and of the lever arms. For 190 correct
+# recordings (KinHEC, real, simulated) the shape was at most -0.25, and below -0.4 in all but six.
+# For inverse streams the shape has the opposite sign.
 _SUSPICIOUS = -0.2
-# Value that is used as the shape if a steady direction of travel decides.
+# Shape that is stored if a steady direction of travel decides between the readings.
 STEADY_SHAPE = 1.0
 
 
@@ -82,15 +83,16 @@ def explain(
     streams : StreamPair
         Streams on one clock.
     thorough : bool
-        Whether to try all wrong axes, too. Set it only if the angular rates of the streams agree.
+        Whether to try all wrong axes as well. Set it only if the angular rates of the streams
+        agree.
     start : (4, 4) array, optional
         Start of the fit without mistakes: an estimate of the extrinsic.
 
     Returns
     -------
     Explanation
-        The plain hypothesis if it holds and no mistake explains far more. Otherwise the hypothesis
-        that holds, or the best one with the finding "unexplained".
+        The plain hypothesis, if it holds and no mistake explains far more. Otherwise the hypothesis
+        that holds; if none holds, the best hypothesis with the finding "unexplained".
 
     Raises
     ------
@@ -112,7 +114,7 @@ def explain(
         if chosen.holds:
             return _with_findings(chosen, streams, lag_s)
         failed.append(chosen)
-        # Try shorter motions: jumps affect fewer of them.
+        # Jumps affect fewer of the shorter motions.
     if not failed:
         raise too_few
     best = min(failed, key=lambda explanation: explanation.fit.unexplained)
@@ -122,7 +124,7 @@ def explain(
 def _plain(
     streams: StreamPair, lag_s: float, start: FloatArray | None
 ) -> Explanation:
-    """Fit the streams without corrections, and once more without the start if it fails."""
+    """Fit the uncorrected streams from ``start``; if this fails, without ``start``."""
     plain = _fitted(PLAIN, streams, lag_s, start)
     if start is not None and not plain.holds:
         plain = _fitted(PLAIN, streams, lag_s)
@@ -134,13 +136,13 @@ def _or_usual_mistake(
 ) -> Explanation:
     """Return the explanation by a usual mistake, or ``plain`` if no mistake is far better."""
     if plain.holds:
-        # Streams of an arm, or on nearly flat ground, may agree in spite of one mistake.
+        # Uncorrected streams of an arm, or on nearly flat ground, may fit in spite of a mistake.
         rivals = [
             hypothesis for hypothesis in USUAL if len(hypothesis.mistakes) == 1
         ]
     else:
         rivals = USUAL
-        # If a body rotates about one of its sensors, the translations of that sensor are noise.
+        # If the body rotates about one of the sensors, the translations of this sensor are noise.
         in_one_unit = _fitted(PLAIN, streams, lag_s, same_unit=True)
         if in_one_unit.holds:
             plain = in_one_unit
@@ -153,7 +155,7 @@ def _with_findings(
 ) -> Explanation:
     """Add the findings to an explanation that holds.
 
-    The result has the likelier reading: that the streams contain poses, or inverse poses.
+    The streams may contain poses or inverse poses. The result has the likelier of these readings.
     """
     doubts: list[Finding] = []
     codes = {code for code, _ in chosen.hypothesis.mistakes}
@@ -166,10 +168,10 @@ def _with_findings(
 def _unexplained(
     best: Explanation, streams: StreamPair, thorough: bool
 ) -> Explanation:
-    """Add the finding "unexplained" to the best of the explanations that do not hold.
+    """Add the finding "unexplained" to the best explanation, if no explanation holds.
 
-    If the search was thorough and the unexplained share is small, noise may be its cause. The
-    explanation then holds, with the finding "noisy".
+    After a thorough search, noise may be the cause of a small unexplained share. The explanation
+    then holds, with the finding "noisy".
     """
     unexplained = best.fit.unexplained
     if thorough and unexplained < _NOISY:
@@ -187,7 +189,7 @@ def _or_rival(
     lag_s: float,
     limit: float,
 ) -> Explanation:
-    """Return the simplest of the best rivals, or ``plain`` if no rival is better by _DECISIVE."""
+    """Return the simplest of the best rivals, or ``plain`` unless they are better by _DECISIVE."""
     if plain.fit.unexplained < EXPLAINED:
         return plain
     most = min(limit, plain.fit.unexplained / _DECISIVE)
@@ -205,7 +207,7 @@ def _simplest(explanations: Sequence[Explanation]) -> Explanation:
 def _below(
     most: float, rivals: Iterable[Hypothesis], streams: StreamPair, lag_s: float
 ) -> list[Explanation]:
-    """Return the rivals whose unexplained share is at most ``most`` and about the smallest."""
+    """Return the rivals with about the smallest unexplained share, which is at most ``most``."""
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
     few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
     first = np.arange(len(pairs))
@@ -216,7 +218,7 @@ def _below(
         motions = motion_pairs.pairs_between(
             parent, child, first, first + len(pairs)
         )
-        # To save time, a fit stops if its start leaves far more than ``most`` unexplained.
+        # Stop a fit early if its start leaves far more than ``most`` unexplained.
         fit = fit_similarity(motions, max_unexplained=_DECISIVE * most)
         tried.append(Explanation(rival, fit))
         most = min(most, _ABOUT_EQUAL * fit.unexplained)
@@ -234,7 +236,7 @@ def _fitted(
     start: FloatArray | None = None,
     same_unit: bool = False,
 ) -> Explanation:
-    """Fit the streams, corrected for the mistakes of a hypothesis."""
+    """Correct the streams by a hypothesis, and fit them."""
     pairs = hypothesis.undo(streams).pairs(lag_s, MAX_PAIRS)
     fit = fit_similarity(pairs, start=start, same_unit=same_unit)
     return Explanation(hypothesis, fit, same_unit=same_unit)
@@ -243,10 +245,10 @@ def _fitted(
 def _or_axes(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, list[Finding]]:
-    """Compare an explanation by wrong orientations with explanations by wrong axes of positions.
+    """Compare wrong orientations with wrong axes of the positions, as explanations.
 
-    If wrong axes explain clearly more, they are returned instead. If they explain about as much,
-    the finding "ambiguous" is returned with the chosen explanation.
+    Wrong axes are returned if they explain clearly more. If they explain about as much, the chosen
+    explanation gets the finding "ambiguous".
     """
     unexplained = chosen.fit.unexplained
     rivals = _below(
@@ -267,15 +269,16 @@ def _or_axes(
 def _steadier(
     chosen: Explanation, streams: StreamPair, lag_s: float
 ) -> tuple[Explanation, bool]:
-    """Find the explanation under which both sensors travel in a steady direction, as on vehicles.
+    """Find the explanation in which both sensors travel in a steady direction, as on vehicles.
 
     Returns
     -------
     Explanation
-        The steadiest explanation that holds, or ``chosen`` if no other one is clearly steadier.
+        The steadiest explanation that holds; ``chosen`` if no other explanation is clearly
+        steadier.
     bool
-        Whether the direction decides between poses and inverse poses. True also for mistakes that
-        are not compared (axes, Euler angles).
+        Whether the direction of travel decides between poses and inverse poses. The value is also
+        True for mistakes whose direction is not compared (axes, Euler angles).
     """
     hypothesis = chosen.hypothesis
     if hypothesis.axes is not None or EULER_ORDER in (
@@ -283,7 +286,7 @@ def _steadier(
         hypothesis.child,
     ):
         return chosen, True
-    # Scatter of the direction under each hypothesis: that of the less steady of both sensors.
+    # Scatter of the direction of travel under each hypothesis, of the less steady sensor.
     scatters = np.maximum.outer(
         _scatters(streams.parent), _scatters(streams.child)
     )
@@ -292,7 +295,7 @@ def _steadier(
     smallest = min(scatter.values())
     clearly_smaller = scatter_of_chosen / trajectory.WRONG_SCATTER_RATIO
     if smallest < min(trajectory.STEADY_SCATTER, clearly_smaller):
-        # Rounding makes the scatter of exact motion negative.
+        # The scatter of exact motion can be slightly negative by rounding.
         limit = max(_ABOUT_EQUAL * smallest, 0.0)
         steadiest = [rival for rival in CONVENTIONAL if scatter[rival] <= limit]
         simplest = min(steadiest, key=lambda rival: rival.complexity)
@@ -303,7 +306,7 @@ def _steadier(
 
 
 def _scatters(stream: trajectory.Trajectory) -> list[float]:
-    """Return the scatter of the direction of travel, corrected for each of CODES_OF_STREAM."""
+    """Return the scatter of the direction of travel for each entry of CODES_OF_STREAM."""
     poses = stream.poses[:: 1 + len(stream) // MAX_PAIRS]
     scatters = []
     for codes in CODES_OF_STREAM:
@@ -317,9 +320,10 @@ def choose_reading(
 ) -> Explanation:
     """Choose whether the streams contain poses or inverse poses, and add the findings.
 
-    Both readings fit equally well: the hypothesis, and the hypothesis with both streams inverted. A
-    steady direction of travel decides, or otherwise the shape of the motion. If the other reading
-    may be right, the result has :class:`Readings`. The caller then compares the noise of both.
+    Both readings fit equally well: the hypothesis, and the same hypothesis with both streams
+    inverted. A steady direction of travel decides; without it, the shape of the motion decides. If
+    the other reading may be right, the result has :class:`Readings`, and the caller compares the
+    noise of both readings.
     """
     former = explanation.hypothesis
     explanation, is_settled = _steadier(explanation, streams, lag_s)
@@ -328,7 +332,8 @@ def choose_reading(
     if _has_one_reading(hypothesis) or (is_settled and is_uninverted_as_before):
         return replace(explanation, findings=findings_of(hypothesis))
     if is_settled:
-        # A steady direction is clear evidence for this hypothesis, the second of the readings.
+        # A steady direction of travel is clear evidence for this hypothesis, which is the second
+        # reading.
         readings = Readings(
             hypotheses=(hypothesis.inverted(), hypothesis),
             shape=STEADY_SHAPE,
@@ -353,14 +358,14 @@ def choose_reading(
 
 
 def _has_one_reading(hypothesis: Hypothesis) -> bool:
-    """Return whether the hypothesis with both streams also inverted need not be compared."""
+    """Return whether there is no need to compare a hypothesis with both streams inverted."""
     if hypothesis.axes is not None:
         return True
     return any(code == "inverse_orientation" for code, _ in hypothesis.mistakes)
 
 
 def _readings(explanation: Explanation, streams: StreamPair) -> Readings:
-    """Return a hypothesis and its inverted one, with the evidence of the shape of the motion."""
+    """Return both readings of a hypothesis, with the evidence of the shape of the motion."""
     hypothesis = explanation.hypothesis
     right = hypothesis.undo(streams)
     paths, arms = evidence_for_inverse(right, explanation.fit)
@@ -378,14 +383,14 @@ def _in_likelier_reading(
     streams: StreamPair,
     lag_s: float,
 ) -> Explanation:
-    """Return the explanation by the likelier hypothesis of two readings, with its findings."""
+    """Return the explanation in its likelier reading, with the findings."""
     hypothesis = explanation.hypothesis
     likelier = readings.hypotheses[int(readings.shape > 0.0)]
     if hypothesis.is_uninverted and not readings.is_clear:
         likelier = hypothesis
     if likelier is not hypothesis:
         explanation = _fitted(likelier, streams, lag_s)
-    # Options that invert streams are set only if the choice is clear.
+    # The options that invert streams are set only if the choice between the readings is clear.
     findings = findings_of(
         likelier, has_options=readings.is_clear or likelier.is_uninverted
     )
@@ -400,7 +405,7 @@ def _in_likelier_reading(
 def findings_of(
     hypothesis: Hypothesis, has_options: bool = True
 ) -> tuple[Finding, ...]:
-    """Return one finding per mistake of a hypothesis.
+    """Return a finding for each mistake of a hypothesis.
 
     Without ``has_options``, the findings about inverse poses lack the options that repair them.
     """

@@ -1,6 +1,6 @@
-"""Hypotheses about mistakes in two streams as data, and the usual ones.
+"""Hypotheses about mistakes in two streams, and a list of the usual hypotheses.
 
-:mod:`.hypotheses` finds the hypothesis under which two streams agree.
+:mod:`.hypotheses` searches for the hypothesis under which two streams agree.
 """
 
 import itertools
@@ -16,11 +16,12 @@ from hand_eye_calib.core.checks.findings import CONVENTIONS, Finding
 from hand_eye_calib.core.checks.stream_pair import StreamPair
 from hand_eye_calib.core.geometry import se3
 
-# A hypothesis holds (the streams agree under it) below this unexplained share.
+# The streams agree under a hypothesis (it holds) if the unexplained share is below this limit.
 HOLDS = 0.12
-# A scale whose logarithm is farther from 0 than this counts as one more mistake.
+# A scale counts as one more mistake if its logarithm differs from 0 by more than this limit.
 _ODD_SCALE = 0.05
-# A shape larger than this, or smaller than its negative, decides if the noise does not decide.
+# The shape of the motion decides between two readings if its absolute value exceeds this limit and
+# the noise does not decide.
 CLEAR_SHAPE = 0.4
 
 # Codes of the mistakes of one stream.
@@ -30,7 +31,7 @@ EULER_ORDER: _Codes = ("euler_order",)
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Mistakes of each stream.
+    """A combination of mistakes in both streams.
 
     Attributes
     ----------
@@ -39,7 +40,7 @@ class Hypothesis:
     axes : (3, 3) array or None
         Matrix that corrects positions in wrong axes: corrected = axes @ position.
     detail : str
-        Axes that (x, y, z) of the positions should be, such as "y -x z".
+        Corrected axes of the positions (x, y, z), such as "y -x z".
     """
 
     parent: _Codes = ()
@@ -68,10 +69,11 @@ class Hypothesis:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Key that sorts hypotheses, the simplest first.
+        """Key that sorts hypotheses; the simplest is first.
 
-        The first number is that of the mistakes; each wrong axis is one more. The second number
-        sorts equal numbers of mistakes: mistakes of the child come first.
+        The first number counts the mistakes; each wrong axis counts as one more. The second number
+        sorts hypotheses with equally many mistakes: mistakes of the child are before those of the
+        parent.
         """
         n_mistakes = len(self.mistakes)
         if self.axes is not None:
@@ -106,7 +108,7 @@ class Hypothesis:
         )
 
     def inverted(self) -> "Hypothesis":
-        """Return the other reading: the hypothesis under which both streams are also inverted.
+        """Return the other reading: the same hypothesis with both streams inverted.
 
         It fits equally well.
         """
@@ -116,7 +118,7 @@ class Hypothesis:
 
 
 def _toggle_inverse(codes: _Codes) -> _Codes:
-    """Return the mistakes of one stream with "inverse" added, or removed if it is among them."""
+    """Add the mistake "inverse" to the mistakes of one stream; remove it if it is already there."""
     return tuple(
         [code for code in CONVENTIONS if (code in codes) != (code == "inverse")]
     )
@@ -132,13 +134,13 @@ class Readings:
         The second hypothesis is the first one with both streams inverted. If one of them inverts
         neither stream, :meth:`ordered` makes it the first.
     shape : float
-        Evidence of the shape of the motion for the second hypothesis: the sum of the log ratios of
-        paths and lever arms. A negative shape is evidence for the first hypothesis.
+        Sum of the log ratios of the paths and of the lever arms. A positive shape is evidence for
+        the second hypothesis, a negative shape for the first.
     paths : float
-        Log ratio of the paths alone.
+        Log ratio of the paths without the lever arms.
     is_small : bool
-        Whether all sensors stay within the reach of an arm. The data of an arm beside a fixed
-        camera look like inverse poses although they are right.
+        Whether all sensors stay within the reach of an arm. Correct data of an arm beside a fixed
+        camera look like inverse poses.
     """
 
     hypotheses: tuple["Hypothesis", "Hypothesis"]
@@ -154,9 +156,9 @@ class Readings:
 
     @property
     def is_clear(self) -> bool:
-        """Whether the shape decides between the hypotheses.
+        """Whether the shape of the motion decides between the hypotheses.
 
-        It does not if a fixed camera beside an arm is another cause of that shape.
+        It does not decide if a fixed camera beside an arm may be the cause of this shape.
         """
         is_fixed_camera = (
             self.is_small
@@ -166,7 +168,7 @@ class Readings:
         return self.by_shape != 0 and not is_fixed_camera
 
     def ordered(self) -> "Readings":
-        """Return the readings with the hypothesis first that inverts neither stream."""
+        """Return the readings, first the hypothesis that inverts neither stream."""
         first, second = self.hypotheses
         if not second.is_uninverted:
             return self
@@ -193,7 +195,7 @@ class Explanation:
     same_unit : bool
         Whether the scale of the fit was fixed to 1.
     readings : Readings or None
-        Both readings, as poses and as inverse poses, if the other reading may be right.
+        Both readings (poses and inverse poses), if the other reading may be right; otherwise None.
     """
 
     hypothesis: Hypothesis
@@ -205,7 +207,7 @@ class Explanation:
 
     @property
     def may_be_uninverted(self) -> bool:
-        """Whether both readings are possible, and in the first one both streams contain poses."""
+        """Whether the other reading may be right, and the first reading inverts no stream."""
         return (
             self.readings is not None
             and self.readings.hypotheses[0].is_uninverted
@@ -218,15 +220,15 @@ class Explanation:
 
     @property
     def complexity(self) -> tuple[int, int]:
-        """Key that sorts explanations, the simplest first. An odd scale is one more mistake."""
+        """Key that sorts explanations, the simplest first. An odd scale counts as a mistake."""
         n_mistakes, of_streams = self.hypothesis.complexity
         has_odd_scale = abs(np.log(self.fit.scale)) > _ODD_SCALE
         return n_mistakes + int(has_odd_scale), of_streams
 
 
 _MIRROR = -np.eye(3)
-# Mistakes of one stream in the convention of its poses. Inverted orientations whose quaternions are
-# in the order w x y z are missing: they equal orientations in other axes.
+# Mistakes that one stream may have in the convention of its poses. One combination is left out:
+# inverse orientations with quaternions in the order w x y z equal orientations in other axes.
 CODES_OF_STREAM: list[_Codes] = [
     (),
     ("inverse",),
@@ -235,16 +237,16 @@ CODES_OF_STREAM: list[_Codes] = [
     ("quaternion_order", "inverse"),
     ("quaternion_names",),
 ]
-# All combinations for both streams.
+# All combinations of these mistakes in both streams.
 CONVENTIONAL = list(
     itertools.starmap(Hypothesis, itertools.product(CODES_OF_STREAM, repeat=2))
 )
-# The hypothesis without a mistake.
+# Hypothesis that both streams are without mistakes.
 PLAIN = CONVENTIONAL[0]
 
 
-# Usual mistakes. Hypotheses with both streams inverted are missing: they fit as well as those
-# with neither stream inverted.
+# Usual mistakes. Hypotheses that invert both streams are left out: they fit as well as hypotheses
+# that invert neither stream.
 USUAL = [
     *(
         usual
@@ -261,8 +263,8 @@ USUAL = [
 def hypotheses_of_axes() -> Iterator[Hypothesis]:
     """Yield hypotheses with permuted and flipped axes of the positions, for either stream.
 
-    The mirror of all three axes is missing, because it is the mistake "left_handed". On flat ground
-    some of these hypotheses fit as well as that of inverted orientations.
+    The mirror of all three axes is left out: it is the mistake "left_handed". On flat ground some
+    of these hypotheses fit as well as inverted orientations.
     """
     flips = itertools.product((1, -1), repeat=3)
     for order, signs in itertools.product(

@@ -1,12 +1,12 @@
 """Checks that two streams are independent measurements.
 
-Streams are not independent if one stream was computed from the other through an assumed transform.
-The extrinsic would then only be a copy of that transform.
+A stream may have been computed from the other stream through an assumed transform. The extrinsic
+would then only be a copy of this transform.
 :mod:`~hand_eye_calib.core.checks.fusion` checks streams that a filter fuses.
 
-Model: errors of two sensors are independent. The variances of their noise add up in the difference
-of the aligned streams, and odometries drift against each other. A stream that was computed from the
-other has a difference with less noise, or without drift.
+Model: the errors of two sensors are independent. The difference of the aligned streams then
+contains the noise of both, and odometries drift against each other. If one stream was computed from
+the other, the difference has less noise or no drift.
 """
 
 from dataclasses import dataclass
@@ -42,65 +42,67 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
-# Orientations are copies if their residual is below this angle (rad): rounding to five digits.
+# Orientations agree to rounding if their residual (rad) is below this angle: numbers with five
+# digits.
 _ROUNDING_RAD = 0.01 * np.radians(0.08)
-# The residual must also be below this share of the rotation angle between the poses.
+# The residual must also be below this share of the angle of rotation between the poses.
 _SMALL_SHARE = 0.005
 
-# Interpolation adds errors. Therefore only those poses are compared whose time to a pose of the
-# other stream is smallest: a hundredth of all poses, but at least the first number. If there are
-# more than the second number, every k-th is used, so that at most the second number remains.
+# Interpolation adds errors. Therefore only poses whose stamps are nearest to a stamp of the other
+# stream are compared: a hundredth of all poses, but at least the first number here. The second
+# number limits the poses: if there are more, every k-th pose is used.
 _NEAREST = (40, 300)
 
-# Noise that both streams share is measured in the upper half of their spectra.
-# Noise is white if both quarters of that half differ by less than this factor.
+# The shared noise of both streams is measured in the upper half of their spectra. The noise counts
+# as white if both quarters of this half differ by less than this factor.
 _FLAT = 1.75
-# Impulses have white spectra like noise, and are removed. An impulse is an acceleration of both
-# streams above this multiple of the median.
+# The spectra of impulses are white like those of noise, so impulses are removed. An impulse is a
+# sample at which the acceleration of both streams exceeds this multiple of the median.
 _ABRUPT = 4.0
-# Largest noise power of the orientations as a share of the power of the rotation. Larger values may
-# be motion that is too fast for the interval between poses.
+# Largest power of the noise of the orientations, as a share of the power of the rotation. A larger
+# power may be motion that is too fast for the interval between poses.
 _LITTLE_NOISE = 1e-3
-# Largest ratio of the noise of the quieter stream to the noise of the difference of both streams:
-# for positions and for orientations. Sensors that shake together have ratios of 1.2 and 16.
+# Largest ratio, for positions and for orientations, of the noise of the quieter stream to the noise
+# of the difference of both streams. Sensors that shake together have ratios of 1.2 and 16.
 _SHARED = np.array([3.0, 30.0])
 
 # Duration of the windows in which positions are aligned, s.
 _WINDOW_S = 3.0
-# Two odometries drift against each other. On a path of at least this length (m), the median
-# distance of aligned positions exceeds the share _LEAST_DRIFT of the path.
+# The drift is judged on paths above this length (m). Two odometries drift against each other, so
+# the median distance of their aligned positions exceeds the share _LEAST_DRIFT of the path.
 _LONG_PATH_M = 400.0
-# The length of the path is summed over steps of this duration, s.
+# Duration (s) of the steps over which the length of the path is summed.
 _STEP_S = 1.0
-# Share of the path. Recordings of two sensors have 5e-5 to 6e-3; two poses of one INS have 2e-8.
+# Smallest drift of two odometries, as a share of the path. Two sensors have 5e-5 to 6e-3; two
+# outputs of one INS have 2e-8.
 _LEAST_DRIFT = 2.5e-5
-# The errors of two odometries add up, so that the difference of their poses grows with time. The
-# growth is that of the largest of six axes: three of positions, three of orientations.
-# Quantile of the differences: most of a recording may be without motion.
+# The difference between two odometries grows with time, because their errors add up. The growth of
+# the fastest of six axes is judged (three of positions, three of orientations). The size of the
+# difference is this quantile: the sensors may rest during most of a recording.
 _DIFFERENCE_SHARE = 0.9
-# Shortest recording (s), and fewest poses, whose growth is judged.
+# Shortest recording (s) whose growth is judged.
 _GROWTH_S = 45.0
 _GROWTH_POSES = 200
-# Times (s) over which errors have grown, up to a third of the recording.
+# Times (s) over which the growth is measured, up to a third of the recording.
 _GROWN_S = (3.0, 8.0, 15.0, 30.0, 60.0)
-# The difference is white noise if it grows by less than this factor from pose to pose on. It grows
-# by 1.4 at least in recordings of two sensors (an arm and a camera), and by 1.19 at most in copies
-# with white noise.
+# The difference is white noise if it grows from pose to pose by less than this factor. It grows by
+# at least 1.4 for two sensors (an arm and a camera), and by at most 1.19 for copies with added
+# white noise.
 _WHITE_GROWTH = 1.25
-# Streams do not drift if positions differ over the whole recording by less than this factor times
-# their distance within windows of _WINDOW_S: 1.58 at least in simulated and real recordings of two
-# odometries on paths above 200 m.
+# Streams do not drift if the distance of aligned positions is smaller than this factor times the
+# same distance within windows of _WINDOW_S. Measured: at least 1.58 for two odometries, simulated
+# and real, on paths above 200 m.
 _STEADY = 1.25
-# Shortest path (m) on which this is judged. Hand-held sensors in a motion capture room, which do
-# not drift either, have shorter paths (100 m).
+# Shortest path (m) on which _STEADY is applied. Hand-held sensors in a motion capture room do not
+# drift either; their paths are shorter (100 m).
 _STEADY_PATH_M = 190.0
-# Noise of the difference of both streams if one stream was computed from the other, as a multiple
-# of the noise of the noisier stream. The noise of a copy contains that of its source; the noise of
-# two sensors adds up. Below the smallest multiple the noisier stream consists of motion, or the
-# copy has so little noise of its own that other checks detect it (_SHARED).
+# Noise of the difference of both streams, divided by the noise of the noisier stream, if one stream
+# is a copy: smallest and largest value. The noise of a copy contains the noise of its source,
+# whereas the noise of two sensors adds up. Below the smallest value, the noisier stream consists of
+# motion, or the copy has so little noise of its own that _SHARED detects it.
 _NOISE_OF_COPY = (0.33, 1.1)
 # The noise of one stream is regressed on the noise of the other. The factor is about 1 for a copy
-# and its source, and 0 for two sensors. A factor above this limit is that of a copy ...
+# and its source, and 0 for two sensors. A stream is a copy if the factor exceeds this limit ...
 _CONTAINED = 0.5
 # ... if it also exceeds this number of standard deviations.
 _CONTAINED_SIGMAS = 4.0
@@ -113,21 +115,20 @@ def check_copies(
 ) -> list[Finding]:
     """Detect a stream that was computed from the other stream.
 
-    Two sensors differ by their noise, for any extrinsic. Computed poses agree with their source to
-    the rounding of numbers. Computed poses with added noise share more white noise with their
-    source than two sensors do. Both tests also work with orientations alone.
+    For any extrinsic, two sensors differ by their noise. A copy agrees with its source to the
+    rounding of numbers. A copy with added noise shares more white noise with its source than two
+    sensors do. Both tests also work with orientations alone.
 
     Parameters
     ----------
     given, aligned : StreamPair
-        The same streams twice: with their recorded stamps, and with the child's stamps on the
-        parent's clock. Other faults of the streams were excluded before.
+        The same streams twice: with the recorded stamps, and with the child's stamps on the
+        parent's clock. Other faults were already excluded.
     are_exact : bool
-        Whether the user called both streams exact, as for motion capture. Agreement to rounding is
-        then a warning instead of an error, and noise is not compared.
+        Whether the user declared both streams as exact, as for motion capture. Agreement to
+        rounding is then a warning instead of an error, and noise is not compared.
     """
-    # A program interpolates its source at the stamps of the computed stream. Either stream may be
-    # the computed one.
+    # A copy is interpolated at its own stamps. Either stream may be the copy.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
     pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
     residual_rad = min(
@@ -153,7 +154,7 @@ def check_copies(
 def _doubt(
     text: str, severity: Severity | None = None, **evidence: float
 ) -> Finding:
-    """Return the finding "not_independent" with a text that names the evidence, and its values."""
+    """Return the finding "not_independent" with the evidence in words, and its values."""
     return finding(
         "not_independent", "both", severity, None, evidence=text, **evidence
     )
@@ -176,8 +177,8 @@ def _second_half(computed: Trajectory, source: Trajectory) -> Trajectory:
 def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     """Return the residual angle (rad) between the rotations of both streams.
 
-    Only the poses of ``computed`` with the smallest time to a pose of ``source`` are used, a
-    hundredth of all (see _NEAREST).
+    Only the poses of ``computed`` whose stamps are nearest to a stamp of ``source`` are used
+    (_NEAREST).
     """
     rows = _within(computed, source)
     stamps_ns = computed.stamps_ns[rows]
@@ -197,10 +198,10 @@ def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
 
 
 def _residual(motions: MotionPairs) -> float:
-    """Return the usual residual angle (rad) of motion pairs after the best rotation of X.
+    """Return the USUAL quantile of the residual angles (rad) after the best rotation of X.
 
-    The result is infinite if there are too few pairs, or if the residual is not far smaller than
-    the usual angle of rotation.
+    The result is infinite for too few motion pairs, or if it is not far smaller than the same
+    quantile of the angles of rotation.
     """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     is_clear = angles < MAX_ROTATION_RAD
@@ -222,11 +223,11 @@ def _residual(motions: MotionPairs) -> float:
 
 
 def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
-    """Return the shared noise of both streams as a multiple of its limit for two sensors.
+    """Return the shared noise of both streams, divided by its limit for two sensors (_SHARED).
 
-    The shared noise is the ratio of the noise of the quieter stream to the noise of the difference.
-    It is large if one stream was computed from the other. The limits are _SHARED. The result is 0
-    if the noise may be motion, or if a pose is missing.
+    The shared noise is the noise of the quieter stream, divided by the noise of the difference. It
+    is large if one stream is a copy. The result is 0 if the noise may be motion, or if a pose is
+    missing.
     """
     intervals_ns = np.diff(computed.stamps_ns)
     if len(computed) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(
@@ -261,7 +262,7 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     is_white = (quarters.max(axis=0) < _FLAT * quarters.min(axis=0))[:2].all()
     if is_white:
         return max(of_positions, of_orientations)
-    # The difference falls as motion does, more steeply than errors that add up.
+    # The difference falls as steeply as motion does, and more steeply than errors that add up.
     is_steep = noise_of_difference[0, 1] > _FLAT**2 * noise_of_difference[1, 1]
     return max(of_orientations, 0.0) if is_steep else 0.0
 
@@ -276,9 +277,9 @@ def _second_differences(Ts: FloatArray) -> FloatArray:
 
 
 def _is_calm(of_computed: FloatArray, of_source: FloatArray) -> BoolArray:
-    """Return which samples (N,) have no impulse that both streams contain.
+    """Return for each sample (N,) whether the streams have no common impulse.
 
-    Arguments are second differences (N, 2, 3) of two streams.
+    The arguments are second differences (N, 2, 3) of both streams.
     """
     sizes = np.linalg.norm([of_computed, of_source], axis=3)
     usual = _ABRUPT * np.median(sizes, axis=1, keepdims=True)
@@ -288,8 +289,8 @@ def _is_calm(of_computed: FloatArray, of_source: FloatArray) -> BoolArray:
 def _upper_quarters(second_differences: FloatArray) -> FloatArray:
     """Return the mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
 
-    ``second_differences`` is (S, N, 2, 3). The spectra are those of the power of poses. The gain of
-    the differences is divided out, see :func:`_upper_spectra`.
+    ``second_differences`` is (S, N, 2, 3). The spectra are of poses: the gain of the differences is
+    divided out, see :func:`_upper_spectra`.
     """
     amplitudes = np.abs(np.fft.rfft(second_differences, axis=1))
     spectra = (amplitudes**2).sum(axis=3)
@@ -396,10 +397,9 @@ class _AlignedPositions:
 
 
 def _is_steady(aligned: _AlignedPositions) -> bool:
-    """Return whether positions differ over the whole recording about as little as within seconds.
+    """Return whether the streams differ over the whole recording hardly more than within seconds.
 
-    Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
-    regression and removed first.
+    Errors of X, scale and clock offset also cause differences. A robust regression removes them.
     """
     rows = aligned.regressors(se3.rotation_of(aligned.pose_pairs.Ts_pw_p))
     values, distances_m = robust_regression(
@@ -419,8 +419,9 @@ def _is_steady(aligned: _AlignedPositions) -> bool:
 def _apart_in_windows(
     stamps_ns: IntArray, points: FloatArray, others: FloatArray
 ) -> float:
-    """Align points (N, 3) in each window of time, and return the median distance (m) of all."""
-    # A window needs enough points, also of a long recording with few of its poses.
+    """Align points (N, 3) in each window of time; return the median distance (m) in all windows."""
+    # Enlarge the windows of a long recording if only few of its poses are used: a window needs
+    # enough points.
     window_ns = max(
         round(_WINDOW_S * 1e9),
         round(2 * MIN_PAIRS * median(np.diff(stamps_ns))),
@@ -430,7 +431,7 @@ def _apart_in_windows(
         windows, return_index=True, return_counts=True
     )
     distances_m = []
-    # Windows with equal numbers of points are aligned at once.
+    # Align all windows with the same number of points at once.
     for count in np.unique(counts[counts >= MIN_PAIRS]):
         rows = firsts[counts == count, None] + np.arange(count)
         distances_m += medians(
@@ -507,7 +508,7 @@ def _factors_of_noise(streams: FloatArray) -> tuple[FloatArray, FloatArray]:
     factors = products.sum(axis=(0, 2)) / divisor
     residuals = copy - factors[:, None] * source
     mean_squares = (np.abs(residuals) ** 2).mean(axis=(0, 2))
-    # The real part of a coefficient has half of its power.
+    # The real part of a complex coefficient has half of its power.
     variances = 0.5 * mean_squares / divisor
     return factors, np.sqrt(variances)
 
@@ -531,7 +532,7 @@ def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
 
 
 def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
-    """Return the _DIFFERENCE_SHARE quantile (d,) of changes of values (N, d) over some poses."""
+    """Return the _DIFFERENCE_SHARE quantile (d,) of the changes of values (N, d) over poses."""
     n_poses = max(n_poses, 1)
     changes = np.abs(values[n_poses:] - values[:-n_poses])
     row = int(_DIFFERENCE_SHARE * len(changes))
@@ -542,11 +543,10 @@ def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
 def _pose_differences(aligned: _AlignedPositions) -> FloatArray:
     """Return the differences (N, 6) of child and parent poses: positions (m), orientations (rad).
 
-    Errors of X, scale and clock offset cause differences as well. They are estimated by a robust
-    regression and removed.
+    Errors of X, scale and clock offset also cause differences. A robust regression removes them.
     """
     rotations = se3.rotation_of(aligned.Ts_pw_c)
-    # Without errors, the rotations from the parent's world to the child's world are constant.
+    # Without errors, the rotation from the parent's world to the child's world is constant.
     between = se3.rotation_of(aligned.pose_pairs.Ts_cw_c) @ np.swapaxes(
         rotations, 1, 2
     )

@@ -1,8 +1,7 @@
-"""Detection of streams with motions instead of poses, or with positions in other axes.
+"""Detect streams that contain motions instead of poses, or positions in other axes.
 
-These checks run if no usual mistake explains the streams, except :func:`check_earth_centred`.
-Each check runs for both streams: functions here examine the child, and the parent is examined by
-exchanging both streams.
+Except :func:`check_earth_centred`, these checks run if no usual mistake explains the streams.
+Functions here examine the child; for the parent, the streams are exchanged.
 """
 
 from collections.abc import Mapping
@@ -22,17 +21,16 @@ from hand_eye_calib.core.checks.stream_pair import LAGS_S, MAX_PAIRS, StreamPair
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import are_earth_centred
 
-# Largest rotation (rad) of a motion from pose to pose. If all orientations of a stream are below
-# this angle, it may hold motions.
+# A stream may contain motions from pose to pose if all its orientations are below this angle (rad).
 _MAX_MOTION_RAD = 1.0
 
-# Smallest rotation (rad) between the axes of positions and orientations that is reported here.
-# Smaller rotations are left to :func:`agreement.check_agreement`.
+# Smallest reported rotation (rad) between the axes of positions and orientations. Smaller rotations
+# are for :func:`agreement.check_agreement`.
 _MIN_TURN_RAD = 0.05
 
-# Rounds of robust weights in the fit of turned positions.
+# Number of reweighted rounds in the fit of rotated positions.
 _ROUNDS = 5
-# Unit of the residuals in this fit (m), at which Huber weights begin to fall.
+# Residual (m) of this fit at which Huber weights begin to fall.
 _RESIDUAL_UNIT_M = 1e-3
 
 
@@ -46,9 +44,9 @@ class _TurnedPositions(NamedTuple):
     rotation : (3, 3) array
         Rotation from the axes of the positions to those of the orientations.
     unexplained : float
-        Share of the motion that stays unexplained with rotated positions.
+        Share of the motion that the rotated positions leave unexplained.
     are_earth_centred : bool
-        Whether the distances from the origin are those of places on the earth.
+        Whether the distances from the origin are about the radius of the earth.
     """
 
     stream: str
@@ -58,7 +56,7 @@ class _TurnedPositions(NamedTuple):
 
 
 def check_misread(streams: StreamPair, aligned: StreamPair) -> list[Finding]:
-    """Return the finding about a misread stream, or none if no misreading explains both streams.
+    """Return the finding about a misread stream, or none if no misreading explains the streams.
 
     Parameters
     ----------
@@ -74,10 +72,10 @@ def check_misread(streams: StreamPair, aligned: StreamPair) -> list[Finding]:
 
 
 def check_earth_centred(aligned: StreamPair) -> list[Finding]:
-    """Return the finding about positions from the centre of the earth in other axes, or none.
+    """Return the finding about earth-centred positions in other axes, or none.
 
-    This check runs before usual mistakes are tried. Positions so far from the origin are a lever
-    arm of inverse poses that explains nearly any motion.
+    This check runs before usual mistakes are tried: the long distance from the origin would be a
+    lever arm of inverse poses, and would explain nearly any motion.
     """
     pairs = _by_examined_stream(aligned)
     earth_centred = {}
@@ -88,16 +86,16 @@ def check_earth_centred(aligned: StreamPair) -> list[Finding]:
 
 
 def _by_examined_stream(streams: StreamPair) -> dict[str, StreamPair]:
-    """Return pairs whose child is the examined stream, by the name of this stream."""
+    """Return two pairs by the name of the examined stream, which is the child of the pair."""
     exchanged = replace(streams, parent=streams.child, child=streams.parent)
     return {"child": streams, "parent": exchanged}
 
 
 def _check_turned(pairs: Mapping[str, StreamPair]) -> list[Finding]:
-    """Return the finding about positions in other axes than the orientations, or none.
+    """Return the finding that positions are in other axes than the orientations, or none.
 
-    ``pairs`` are examined streams by their name. Either stream may explain motion in a plane; the
-    better explanation counts.
+    ``pairs`` are pairs by the name of the examined stream. On a plane, both streams may explain the
+    motion; the better explanation is used.
     """
     turned = [_find_turn(name, pair) for name, pair in pairs.items()]
     best = min(
@@ -155,7 +153,7 @@ def _unexplained(streams: StreamPair) -> float:
 def _find_turn(name: str, streams: StreamPair) -> _TurnedPositions | None:
     """Fit a rotation of the child's positions; return None if none explains the streams.
 
-    ``name`` is that of the examined stream, the child of the pair.
+    ``name`` is the name of the examined stream, the child of the pair.
     """
     child = streams.child
     for lag_s in LAGS_S:
@@ -181,8 +179,9 @@ def _find_turn(name: str, streams: StreamPair) -> _TurnedPositions | None:
 def _fit_turn(streams: StreamPair, lag_s: float) -> FloatArray:
     """Return the rotation W (3, 3) from the axes of the child's positions to its orientations.
 
-    Robust least squares of ``R_X R_ci' W d = (R_A - I) t_X + t_A`` over a lag: d is the child's
-    displacement and R_ci its first orientation, (R_A, t_A) the parent's motion, t_X the lever arm.
+    Robust least squares of ``R_X R_ci' W d = (R_A - I) t_X + t_A`` over one lag. d is the
+    displacement of the child and R_ci its first orientation. (R_A, t_A) is the motion of the
+    parent, and t_X is the lever arm.
     """
     pairs = streams.pairs(lag_s, MAX_PAIRS)
     poses = streams.synchronised

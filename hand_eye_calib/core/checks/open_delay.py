@@ -1,13 +1,13 @@
 """Covariance of an extrinsic for a delay of positions that a recording neither proves nor excludes.
 
-Positions may be late against the orientations of their stream. At constant speed such a delay
-equals a lever arm, so that even a long recording estimates the delay to some milliseconds only. A
-delay below the limit of a finding still shifts the extrinsic.
+The positions of a stream may be later than its orientations. At constant speed such a delay equals
+a lever arm, so even a long recording determines the delay only to some milliseconds. A delay below
+the limit of a finding still shifts the extrinsic.
 
-Model: most streams have delays tau with the standard deviation of the allowance. A few streams
-have a fault, and a larger standard deviation. The regression estimates the delay with a normal
-error. The mean square of tau that Bayes' rule returns for the faulty streams, times the squared
-change of the extrinsic for a unit delay, is the covariance.
+Model: in most streams the standard deviation of the delay is that of the allowance; in a few faulty
+streams it is larger. The regression estimates the delay with a normal error. Bayes' rule returns
+the probability of a fault and the mean square of its delay. The covariance is their product, times
+the squared change of the extrinsic for a delay of 1 s.
 """
 
 from typing import NamedTuple
@@ -27,12 +27,11 @@ from hand_eye_calib.core.geometry import se3
 
 _STREAMS = ("child", "parent")
 
-# Share of the streams whose positions are late by a fault, and the standard deviation of their
-# delays (s).
+# Share of the streams whose positions are late by a fault.
 _FAULTY_SHARE = 0.1
 _FAULTY_S = 0.03
-# Largest standard deviation (s) of an estimated delay. A less certain estimate changes nothing: the
-# allowance was measured on such recordings.
+# An estimated delay with a larger standard deviation (s) than this is ignored: the allowance was
+# measured on such recordings, so it covers such delays.
 _MAX_SIGMA_S = 0.015
 
 
@@ -45,19 +44,19 @@ class OpenDelay(NamedTuple):
         Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, in addition to
         the allowance.
     found : Finding or None
-        A note, if the covariance is large.
+        A note if the covariance is large; otherwise None.
     """
 
     covariance: FloatArray
     found: Finding | None = None
 
 
-#: Result of a check without an open delay.
+#: Result if no delay is open.
 NO_DELAY = OpenDelay(np.zeros((6, 6)))
 
 
 def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
-    """Return the delay that adds most to the covariance of an extrinsic.
+    """Return the open delay with the largest covariance of the extrinsic.
 
     Parameters
     ----------
@@ -66,7 +65,7 @@ def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
     X : (4, 4) array
         Extrinsic of the regression.
     """
-    # A late child is nearly the same as an early parent, so only one of both counts.
+    # A late child and an early parent are nearly the same, so only the larger covariance counts.
     delays = [_of_stream(fast, stream, X) for stream in _STREAMS]
     return max(
         delays, key=lambda delay: float(np.trace(delay.covariance[:3, :3]))
@@ -74,7 +73,7 @@ def open_delay(fast: Regression, X: FloatArray) -> OpenDelay:
 
 
 def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
-    """Return the open delay of the positions of a stream."""
+    """Return the open delay of the positions of one stream."""
     group = f"late_{stream}"
     delays_s, sigmas_s = fast.fit(group)
     delay_s = float(delays_s[0])
@@ -82,7 +81,7 @@ def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
     if not sigma_s < _MAX_SIGMA_S:
         return NO_DELAY
     variance_s2 = faulty_variance(delay_s, sigma_s)
-    # Change of the lever arm (m) and rotation of X (rad) in the parent's axes for a delay of 1 s.
+    # Change of X in the parent's axes for a delay of 1 s: lever arm (m) and rotation (rad).
     response = fast.response(group)[:, 0]
     R_child_parent = se3.rotation_of(X).T
     by_delay = np.concatenate(
@@ -106,9 +105,8 @@ def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
 
 
 def faulty_variance(delay_s: float, sigma_s: float) -> float:
-    """Return the mean square (s^2) of a delay by a fault, given its estimate.
+    """Return the mean square (s^2) of a delay by a fault, times the probability of the fault.
 
-    The mean square contains the probability of a fault.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Checks whether one extrinsic is right for all parts of a recording.
+"""Checks whether one extrinsic fits all parts of a recording.
 
-A stream that starts anew with other axes, or streams that are exchanged, leave parts that are sound
-by themselves. A robust solve follows the larger part and rejects the other part as outliers.
+If a stream restarts with other axes, or if the streams are exchanged, each part of the recording is
+sound. A robust solve follows the larger part, and rejects the other part as outliers.
 """
 
 from dataclasses import replace
@@ -28,40 +28,40 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.solvers.all_pairs import align_rotation_vectors
 
-# Shares of the poses before the time at which a recording is split in two.
+# A recording is split in two parts after each of these shares of its poses.
 _SPLITS = (0.5, 0.25, 0.75)
-# Largest share of its rotations that the extrinsic rotation of a sound part leaves unexplained.
+# A part is sound if its own extrinsic rotation leaves at most this share of its rotations
+# unexplained.
 _SOUND_PART = 0.25
-# A part has other axes than the other part if the other part's extrinsic rotation leaves more than
-# this share of its rotations unexplained.
+# Two parts differ if the extrinsic rotation of one part leaves more than this share of the other
+# part's rotations unexplained.
 _OTHER_PART = 0.5
 
-# Number of blocks of time. At the start of each block except the first, an exchange of the streams
-# is tested.
+# Number of blocks of time. An exchange of the streams is tested at the start of each block but the
+# first.
 _EXCHANGE_BLOCKS = 16
-# Blocks at the start and at the end of a recording whose own extrinsics are tried.
+# Number of blocks, at the start and at the end of a recording, whose own extrinsics are tried.
 _END_BLOCKS = 4
-# Largest number of motions for such an extrinsic.
+# Largest number of motions from which such an extrinsic is estimated.
 _MAX_MOTIONS_OF_END = 300
-# Motions that are shorter than this share of the median displacement are ignored: residuals of a
-# sensor at rest are small with any extrinsic.
+# Motions shorter than this share of the median displacement are skipped: at rest, every extrinsic
+# fits.
 _MOVING_SHARE = 0.3
-# Share of the displacements that an extrinsic of another part leaves unexplained, and the smallest
-# factor between this share and that of the extrinsic's own part.
+# Smallest share of its displacements that another part must leave unexplained.
 _OTHER_SHARE = 0.25
 _OTHER_FACTOR = 3.0
 
-# Quantile of the residuals that is compared: it is outside of the larger part.
+# Quantile of the residuals that is compared. It must lie in the smaller part.
 _EXCHANGE_QUANTILE = 0.85
-# Streams are exchanged if that leaves less than this share of the residuals.
+# Streams are exchanged if the exchange reduces this quantile of the residuals below this share.
 _EXCHANGE_GAIN = 0.4
 
 
 def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
-    """Return the finding that the extrinsic rotation differs between two parts, or none.
+    """Return the finding that two parts have different extrinsic rotations, or none.
 
-    A stream that starts anew with other axes leaves two sound parts of a recording, and so do
-    streams that are exchanged. The noise model follows one part and rejects the other as outliers.
+    A restart of a stream with other axes, and an exchange of the streams, leave two sound parts.
+    The noise model follows one part and rejects the other part as outliers.
     """
     motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
@@ -99,15 +99,15 @@ def check_other_extrinsic(
 ) -> list[Finding]:
     """Return the finding that a part of a recording has another extrinsic, or none.
 
-    On flat ground one rotation explains the rotations before and after an exchange of the streams,
-    or after a restart with another heading. Only the displacements differ.
+    On flat ground, one extrinsic rotation may explain both parts: before and after an exchange of
+    the streams, or a restart with another heading. Only the displacements then differ.
 
     Parameters
     ----------
     pose_pairs : PosePairs
         Poses on one clock, in one unit of length.
     X : (4, 4) array
-        Extrinsic of the recording.
+        Extrinsic of the whole recording.
     """
     motions = pairs_over(pose_pairs, SHORT_S, MAX_SHORT_MOTIONS)
     lengths_m = np.linalg.norm(
@@ -149,7 +149,7 @@ def _seconds_at(stamps_ns: IntArray, row: int) -> float:
 def _parts_turned(
     first: FloatArray, second: FloatArray, at_s: float
 ) -> Finding:
-    """Return the finding that the extrinsics (4, 4) of two parts have different rotations."""
+    """Return the finding that two extrinsics (4, 4) of parts have different rotations."""
     between = se3.rotation_of(first).T @ se3.rotation_of(second)
     turned_rad = float(se3.rotation_angle(between))
     return finding(
@@ -167,7 +167,7 @@ def _exchanged(motions: MotionPairs) -> MotionPairs:
 
 
 def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
-    """Return the shares (K,) of the displacements that an extrinsic X (4, 4) leaves unexplained."""
+    """Return the share (K,) of each displacement that an extrinsic X (4, 4) leaves unexplained."""
     residuals_m, _ = motions.residuals(X)
     lengths_m = np.linalg.norm(
         se3.translation_of(motions.Ts_parenti_parentj), axis=1
@@ -178,7 +178,7 @@ def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
 
 
 def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
-    """Return the fit of the motions of a part, or None if no extrinsic explains the part."""
+    """Return the fit to the motions of a part, or None if no extrinsic fits."""
     stride = -(-len(motions) // _MAX_MOTIONS_OF_END) or 1
     try:
         fit = fit_similarity(motions[::stride], same_unit=True)
@@ -194,17 +194,17 @@ def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
 def _other_part(
     shares: FloatArray, block_of: IntArray
 ) -> tuple[int, BoolArray]:
-    """Return the block that another part starts or ends in, and a mask (K,) of that part.
+    """Return the block at which another part begins or ends, and a mask (K,) of the other part.
 
-    ``shares`` (K,) are the unexplained shares of motions, and ``block_of`` (K,) their blocks. The
-    mask is empty if no part differs clearly from the rest.
+    ``shares`` (K,) are the unexplained shares of the motions, and ``block_of`` (K,) the blocks of
+    the motions. The mask is empty if no part differs clearly.
     """
     blocks = np.unique(block_of)
     usual = np.array([median(shares[block_of == block]) for block in blocks])
     best = _OTHER_FACTOR
     cut = 0
     is_other = np.zeros(len(shares), dtype=bool)
-    # The block with the cut contains motions of both parts, and is ignored.
+    # The block at the cut is skipped, because it contains motions of both parts.
     for k in range(1, len(blocks) - 1):
         before = usual[:k]
         after = usual[k + 1 :]
@@ -223,10 +223,10 @@ def _other_part(
 def _check_exchanged(
     motions: MotionPairs, stamps_ns: IntArray
 ) -> Finding | None:
-    """Return the finding that parent and child are exchanged from some time on, or None.
+    """Return the finding that parent and child are exchanged from a certain time on, or None.
 
-    One rotation R maps rotation vectors of the child to those of the parent. After an exchange it
-    maps those of the parent to those of the child. R is estimated for each possible time.
+    One rotation R maps rotation vectors of the child to rotation vectors of the parent. After an
+    exchange, R maps the parent's to the child's. R is estimated for each possible time.
     """
     if len(motions) < MIN_PAIRS:
         return None
@@ -259,7 +259,8 @@ def _check_exchanged(
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
     """Return the share of the rotations that an extrinsic X (4, 4) leaves unexplained.
 
-    It is the median residual of the largest quarter of the rotations, divided by their median.
+    The share is the median residual divided by the median angle, of the quarter with the largest
+    angles.
     """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     are_large = angles >= quantile(angles, 0.75)

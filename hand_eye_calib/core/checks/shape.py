@@ -1,8 +1,8 @@
 """Shape of the motion: evidence for poses or for inverse poses in both streams.
 
-The rigid mount fits both equally well. But some point of a moving body, such as an axle, has a
-short path. If the poses are inverse, a point with a short path is one of the world in the frame of
-the body. The log ratio of the shortest paths, under both interpretations, is the evidence.
+A rigid mount fits poses and inverse poses equally well. But some point of a moving body, such as a
+point of the axle, has a short path. For inverse poses, the point with a short path belongs to the
+world instead of the body. The log ratio of the shortest paths in both readings is the evidence.
 """
 
 import numpy as np
@@ -14,32 +14,33 @@ from hand_eye_calib.core.checks.stream_pair import LAGS_S, StreamPair
 from hand_eye_calib.core.checks.streams import coarse
 from hand_eye_calib.core.geometry import se3
 
-# Log ratio of the paths that sensors around a target cause, although their poses are not inverse.
-# Measured: 0.4 for a camera around its target.
+# Log ratio of the paths for sensors that move around a target, although their poses are not
+# inverse. Measured: 0.4 for a camera.
 _TARGET_LOG_RATIO = 0.5
 
 # Reweighted rounds of the search for the point with the shortest path.
 _ROUNDS = 5
 
-# Two frames with a smaller angle (rad) may be the same frame, up to the drift of the streams. In 50
+# Two frames may be the same frame if the angle (rad) between them is smaller than this drift. In 50
 # simulated recordings of up to four minutes in one world, the drift was at most 0.03 rad.
 _SAME_FRAME_RAD = 0.1
-# Shorter lever arms (m) count as this length.
+# Shorter lever arms (m) are replaced by this length.
 _MIN_ARM_M = 0.01
-# Largest absolute evidence of the lever arms. Two worlds may have the same origin by chance. So the
-# lever arms must not outweigh clear paths, whose log ratio was 0.7 at least on machines.
+# Largest absolute evidence of the lever arms. Two worlds may have the same origin by chance, so
+# lever arms must not outweigh clear paths. On machines, the log ratio of the paths was at least
+# 0.7.
 _MAX_OF_ARMS = 0.5
 
-# Reach of a robot arm (m). The path of the hand may be longer than that of the base in the frame of
-# the hand. Poses within this distance may therefore be right although they look inverse.
+# Reach of a robot arm (m). The path of a hand may be longer than the path of the base in the frame
+# of the hand. Correct poses within this reach may therefore look inverse.
 _REACH_M = 3.0
 
 
 def may_be_an_arm(streams: StreamPair) -> bool:
     """Return whether the sensors may be those of a robot arm.
 
-    The streams then consist of single stops, or their poses and inverse poses stay within the reach
-    of an arm.
+    This is so if the streams consist of single stops, or if both the poses and the inverse poses
+    stay within the reach of an arm.
     """
     if streams.is_slow:
         return True
@@ -59,9 +60,9 @@ def evidence_for_inverse(
 ) -> tuple[float, float]:
     """Compute the evidence for inverse poses in both streams.
 
-    Sensors that move around a target have paths like those of inverse poses. Their shortest path,
-    that of the target, is less than half of the path of the sensor. The log ratio of the paths is
-    then reduced by that of a target.
+    The paths of sensors that move around a target look inverse: the shortest path, that of the
+    target, is less than half of the sensor's path. The log ratio that a target can cause is then
+    subtracted.
 
     Parameters
     ----------
@@ -73,14 +74,14 @@ def evidence_for_inverse(
     Returns
     -------
     float, float
-        Log ratio of the paths, and half the log ratio of the lever arms (limited): those of the
-        streams as they are over those of inverse streams. Positive values are evidence for inverse
+        Log ratio of the paths, and half the log ratio of the lever arms (limited). Both ratios are:
+        the recorded streams over the inverse streams. Positive values are evidence for inverse
         poses.
     """
     logs = []
     for stream in (corrected.parent, corrected.child):
         poses = coarse(stream, LAGS_S[-1]).poses
-        # Stops are poses without the motion between them, so that changes of velocity are unknown.
+        # The motion between stops is not recorded, so the changes of velocity are unknown.
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
         shortest, path_of_origin = _shortest_path(poses, order)
         shortest_of_inverse, _ = _shortest_path(se3.inverse(poses), order)
@@ -95,11 +96,10 @@ def evidence_for_inverse(
 
 
 def _evidence_of_lever_arms(corrected: StreamPair, fit: SimilarityFit) -> float:
-    """Return half the log ratio of the lever arms between the sensors and between the worlds.
+    """Return half the log ratio of two lever arms: between the sensors, and between the worlds.
 
-    The result has limits, see _MAX_OF_ARMS. The result is 0 if the shorter lever arm is that of two
-    frames that may be the same. Two streams may have the same world, apart from drift, or the same
-    sensor frame: their short lever arm is no evidence.
+    The result is limited to _MAX_OF_ARMS. A short lever arm is no evidence if both streams may have
+    the same world (apart from drift) or the same sensor frame; the result is then 0.
     """
     pairs = corrected.synchronised.child_scaled(fit.scale)
     worlds = pairs.Ts_pw_p @ fit.T_parent_child @ se3.inverse(pairs.Ts_cw_c)
@@ -115,7 +115,7 @@ def _evidence_of_lever_arms(corrected: StreamPair, fit: SimilarityFit) -> float:
 
 
 def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:
-    """Return the lengths (m) of the shortest path of a point of the body, and of its origin's path.
+    """Return the path lengths (m) of the body's point with the shortest path, and of its origin.
 
     A point p of the body is at R p + t. Its path is the sum of the sizes of the changes of R p + t:
     the first differences for ``order`` 1, the second differences for ``order`` 2.

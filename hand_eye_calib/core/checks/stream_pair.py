@@ -1,4 +1,4 @@
-"""Two streams whose clocks nearly agree, and the motion pairs that they have in common."""
+"""Two streams with nearly equal clocks, and the motion pairs that both contain."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,21 +11,20 @@ from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing import motion_pairs
 
-# Durations (s) of the motions that are compared. Shorter motions are used only if longer motions
-# disagree.
+# Durations (s) of the compared motions. Shorter motions are used only if longer motions disagree.
 LAGS_S = (3.0, 1.0, 0.4)
-# Largest number of motions in a fit.
+# Largest number of motions in one fit.
 MAX_PAIRS = 400
-# Smallest number of motions in a fit.
+# Smallest number of motions in one fit.
 MIN_PAIRS = 12
 
-# Largest angle (rad) of a rotation vector that is used: near pi its sign is ambiguous.
+# Larger rotation vectors (rad) are skipped: near pi their sign is ambiguous.
 MAX_ROTATION_RAD = 2.8
 
 
 @dataclass(frozen=True)
 class StreamPair:
-    """Two streams whose clocks nearly agree.
+    """Two streams with nearly equal clocks.
 
     Attributes
     ----------
@@ -68,7 +67,7 @@ class StreamPair:
         Raises
         ------
         NotEnoughDataError
-            If the streams have fewer than MIN_PAIRS of them.
+            If the streams have fewer than MIN_PAIRS motion pairs.
         """
         pairs = motion_pairs.pairs_over(self.synchronised, lag_s, max_pairs)
         if len(pairs) < MIN_PAIRS:
