@@ -1,4 +1,4 @@
-"""Checks of the stamps and poses of one stream, and of its motion against the other stream."""
+"""Checks of one stream's stamps and poses, and of its motion against the other stream."""
 
 import itertools
 
@@ -21,87 +21,87 @@ from hand_eye_calib.core.pairing.motion_pairs import find_leap
 # A gap is longer than the option max_gap, and longer than this multiple of the median interval.
 _GAP_INTERVALS = 5.0
 
-# A step is a jump if its excess over the steps around it exceeds two limits.
-# Limit as a multiple of the median excess.
+# A step is a jump if its excess over the neighbouring steps exceeds the next two limits. First
+# limit, as a multiple of the median excess.
 _JUMP_EXCESSES = 12.0
-# Limit as a multiple of the speed that nine tenths of the steps do not exceed.
+# Second limit, as a multiple of the USUAL quantile of the speeds.
 _JUMP_SPEEDS = 3.0
 
-# A stream is not flat if its tilt (root mean square, rad) exceeds this angle.
+# A stream counts as flat if its tilt (root mean square, rad) is at most this angle.
 _MIN_TILT_RAD = 0.02
 
-# Shortest time (s) for which a frozen stream repeats its pose.
+# Shortest time (s) for which a pose must repeat before a stream counts as frozen.
 _MIN_FROZEN_S = 1.0
-# The motion of the other sensor is checked in parts of about this duration (s), because a car may
-# wait for a minute and then drive.
+# The motion of the other sensor is checked in parts of about this duration (s): a car may wait for
+# a minute before it drives.
 _PART_S = 10.0
 
-# A sensor moves if its distance or its angle from the start of a part exceeds the limits below.
-# Measured: odometry drifts by up to 6 cm and 0.05 rad while a car waits 42 s at traffic lights.
-# Limit of the distance, m.
+# A sensor moves if its distance or its angle from the start of a part exceeds the next three
+# limits. Measured: odometry drifts by up to 6 cm and 0.05 rad while a car waits 42 s at traffic
+# lights. Limit of the distance, m.
 _MOVES_M = 0.02
 # Limit of the angle, rad.
 _MOVES_RAD = 0.1
-# Limit of the distance, as a share of the usual speed times the duration of the part.
+# Limit of the distance, as a share of the distance that the sensor usually travels in the part.
 _MOVES_SHARE = 0.1
 
-# The distance or angle must also exceed the noise by this factor. Noise is the median second
-# difference. Measured: the largest distance of white noise is 2.2 times that in 6,000 draws.
+# Smallest ratio of the distance or the angle to the noise, for a sensor that moves. The noise is
+# the median second difference. Measured: white noise had ratios up to 2.2 in 6,000 draws.
 _MOVES_NOISES = 2.5
 
 # If several sensors publish on one topic in turn, the positions repeat with a period (in poses).
-# The roughness from pose to pose exceeds the roughness over a period by at least this factor.
+# The roughness from pose to pose then exceeds the roughness over a period by at least this factor.
 _MIN_ROUGHNESS_RATIO = 2.0
 # Longest period, in poses.
 _MAX_PERIOD = 6
-# Smallest roughness from pose to pose, m.
+# Smallest roughness (m) from pose to pose that is judged.
 _MIN_ROUGHNESS_M = 0.01
-# Largest share of repeated positions. Streams that repeat poses are rough for another reason.
+# Largest share of repeated positions. Streams that repeat poses are rough for this other reason.
 _MAX_REPEATS = 0.1
-# The level of a sensor is the mean deviation of its positions from the line between neighbouring
-# positions of the stream. The mean is over this number of periods.
+# The level of a sensor is the mean deviation of its positions from the line between the
+# neighbouring positions. This is the number of periods in the mean.
 _PERIODS_OF_LEVEL = 40
-# Smallest share of the mean squared deviation that the levels explain. A body that shakes or walks
-# may have nearly the same period, but its levels vary, so they explain less.
+# Smallest share of the mean squared deviation that the levels must explain. The motion of a body
+# that shakes or walks may have nearly the same period, but its levels vary and explain less.
 _MIN_EXPLAINED_BY_LEVELS = 0.6
 
-# Positions are on a grid if most differences are multiples of the smallest difference (the step).
-# Smallest number of differences.
+# Positions are rounded to a grid if most differences are multiples of the smallest difference (the
+# step). Fewest differences that are judged.
 _MIN_GRID = 30
-# Smallest share of multiples among the differences.
+# Smallest share of the differences that are multiples of the step.
 _ON_GRID = 0.98
-# Largest distance from a multiple, as a share of the step.
+# Largest deviation from a multiple, as a share of the step.
 _GRID_TOLERANCE = 0.06
 # Differences above this multiple of the step are skipped.
 _MAX_MULTIPLE = 200.0
-# Steady motion has equal differences as well. A stream whose motion is rarely interrupted must
-# therefore have this number of different multiples.
+# Fewest different multiples in a stream whose motion is rarely interrupted. Without rounding,
+# steady motion also has equal differences.
 _MIN_DIFFERENT = 5
-# Rounding interrupts slow motion: zeros follow at least this share of the other differences. A
-# vehicle that drives steadily and then parks is interrupted once.
+# Smallest share of the other differences that a difference of zero follows. Rounding often
+# interrupts slow motion; a vehicle that drives steadily and then parks is interrupted once.
 _MIN_INTERRUPTED = 0.1
 
-# Highest speed (m/s) of a vehicle that calibrates its sensors by motion: the speed of sound.
+# Speed (m/s) above which lengths cannot be in metres: the speed of sound.
 _FASTEST = 340.0
-# Largest change of velocity within a second (m/s^2) that a tenth of all seconds may exceed: five
-# times gravity. Recordings have 6 at most. Arms move least and have 0.1, which exceeds the limit in
-# millimetres. Hand-held sensors exceed the limit in centimetres.
+# Change of velocity within a second (m/s^2) that a tenth of all seconds may exceed if lengths are
+# in metres: five times gravity. Recordings have at most 6. Arms have the smallest changes, 0.1; in
+# millimetres they exceed the limit. Hand-held sensors exceed it in centimetres.
 _HARDEST = 49.0
-# A sensor farther than this (m) from the other sensor is on a car or a larger machine.
+# If the sensors are farther apart than this (m), they are on a car or a larger machine.
 _LONG_LEVER_M = 3.0
-# Largest change of velocity (m/s^2) of such machines. Tyres and rails transmit about 8 m/s^2.
-# Simulated cars change their velocity by up to 7.2 m/s within a second.
+# The same limit (m/s^2) for such machines. Tyres and rails transmit about 8 m/s^2. Simulated cars
+# change their velocity by up to 7.2 m/s within a second.
 _HARDEST_OF_LARGE = 9.8
-# Largest usual change of velocity within a second (m/s): that of cars.
+# Largest usual change of velocity within a second (m/s), of cars.
 _MOST_USUAL = 8.0
-# Smallest usual change of velocity within a second (m/s): that of arms.
+# Smallest usual change of velocity within a second (m/s), of arms.
 _LEAST_USUAL = 0.1
-# Slowest usual speed (m/s) of a sensor while it is calibrated. Arms have 0.05.
+# Smallest usual speed (m/s) of a sensor during a calibration. Arms have 0.05.
 _SLOWEST = 0.01
 
-# Time over which velocities are computed (s), so that noise contributes little.
+# Step (s) over which velocities are computed. It is long, so that noise contributes little.
 _STEP_S = 1.0
-# A usual size is this quantile of all sizes: up to a tenth of the velocities may be jumps.
+# Quantile of speeds and sizes that counts as usual: up to a tenth may be jumps.
 USUAL = 0.9
 
 
@@ -114,7 +114,7 @@ def coarse(trajectory: Trajectory, step_s: float) -> Trajectory:
 
 
 def are_gaps(intervals_s: FloatArray, max_gap_s: float) -> BoolArray:
-    """Detect gaps among the intervals (N,) between poses, in seconds.
+    """Return which of the intervals (N,) between poses, in seconds, are gaps.
 
     A gap is longer than ``max_gap_s``, and much longer than the median interval of the stream.
     """
@@ -180,7 +180,7 @@ def check_positions(
     step_m = max(
         _grid_step(column) for column in se3.translation_of(trajectory.poses).T
     )
-    # In a stream without orientations, rounding is noise like any other: never an error.
+    # A stream without orientations is at most warned of: its rounding acts like other noise.
     most = (
         np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     )
@@ -191,10 +191,10 @@ def check_positions(
 
 
 def _interleaved(trajectory: Trajectory) -> float:
-    """Return the roughness (m) of positions that alternate between sensors, or 0 for one sensor.
+    """Return the roughness (m) of positions from several sensors in turn, or 0 for one sensor.
 
-    Sensors that publish on one topic do so in turn, with a period in poses. Neighbouring poses then
-    differ more than poses that are one period apart.
+    Several sensors on one topic publish in turn, with a period in poses. Neighbouring poses then
+    differ more than poses one period apart.
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
@@ -202,7 +202,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     fewest = (_PERIODS_OF_LEVEL + 2) * _MAX_PERIOD
     if len(positions) < fewest or repeats.mean() > _MAX_REPEATS:
         return 0.0
-    # Deviations of each position from the line between the positions ``lag`` before and after.
+    # Deviation of each position from the line between the positions ``lag`` poses before and after.
     deviations = []
     for lag in range(1, _MAX_PERIOD + 1):
         before = positions[: -2 * lag]
@@ -215,7 +215,7 @@ def _interleaved(trajectory: Trajectory) -> float:
     roughness_m = [
         median(np.linalg.norm(vectors, axis=1)) for vectors in deviations
     ]
-    # Positions that alternate are rough from pose to pose, and smooth over whole periods.
+    # Positions of several sensors are rough from pose to pose, and smooth over whole periods.
     period = 2 + int(np.argmin(roughness_m[1:]))
     if roughness_m[0] < max(
         _MIN_ROUGHNESS_RATIO * roughness_m[period - 1], _MIN_ROUGHNESS_M
@@ -225,7 +225,8 @@ def _interleaved(trajectory: Trajectory) -> float:
     in_sensor = np.einsum(
         "kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world
     )
-    # The levels repeat with the period, in the axes of the world or in those of the sensor.
+    # The levels of the sensors are constant either in the axes of the world or in those of the
+    # sensor.
     for vectors in (in_world, in_sensor):
         n_windows = len(vectors) // (_PERIODS_OF_LEVEL * period)
         n_used = n_windows * _PERIODS_OF_LEVEL * period
@@ -243,7 +244,7 @@ def _interleaved(trajectory: Trajectory) -> float:
 
 
 def _grid_step(values: FloatArray) -> float:
-    """Return the step (m) if nearly all differences of values (N,) are its multiples, else 0."""
+    """Return the step (m) of the grid to which values (N,) are rounded, or 0 without a grid."""
     steps = np.abs(np.diff(values))
     is_moving = steps > SAME_POSE
     differences = steps[is_moving]
@@ -264,7 +265,7 @@ def _grid_step(values: FloatArray) -> float:
 
 
 def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
-    """Return the finding about a stream with only x, y and yaw while the other tilts, or none."""
+    """Return the finding that a stream has only x, y and yaw although the other tilts, or none."""
     for name, flat, other, whole in (
         ("parent", parent, "child", child),
         ("child", child, "parent", parent),
@@ -276,8 +277,8 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
             or np.ptp(heights) > SAME_POSE
         ):
             continue
-        # The scatter in the world of the other sensor's axis of rotation: the direction in that
-        # sensor whose image in the world scatters least.
+        # Find the direction in the other sensor whose image in the world scatters least. Its
+        # scatter measures the tilt.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
         tilt_rad = float(
             np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0))
@@ -295,7 +296,7 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
 
 
 def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
-    """Return the findings about a stream that repeats its pose while the other moves.
+    """Return the findings about a stream that repeats a pose while the other sensor moves.
 
     Both streams are on one clock.
     """
@@ -342,7 +343,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
 
 
 def _moves(part: Trajectory, usual_m_s: float) -> bool:
-    """Return whether a sensor moves by more than drift and noise in a part of its stream."""
+    """Return whether a sensor moves in a part of its stream, by more than drift and noise."""
     if len(part) < 2:
         return False
     positions = se3.translation_of(part.poses)
@@ -356,7 +357,7 @@ def _moves(part: Trajectory, usual_m_s: float) -> bool:
 
 
 def _exceeds(away: FloatArray, least: float) -> bool:
-    """Return whether the longest of the vectors (N, 3) exceeds ``least`` and a limit of noise."""
+    """Return whether the longest of the vectors (N, 3) exceeds ``least`` and the noise."""
     rough = np.linalg.norm(np.diff(away, 2, axis=0), axis=1)
     noise = median(rough) if len(rough) else 0.0
     largest = float(np.linalg.norm(away, axis=1).max())
@@ -366,14 +367,14 @@ def _exceeds(away: FloatArray, least: float) -> bool:
 def check_lengths(
     parent: Trajectory, child: Trajectory, lever_arm_m: float = 0.0
 ) -> list[Finding]:
-    """Detect lengths in another unit than metres, from a motion that no vehicle has in metres.
+    """Return the finding that the lengths are not in metres, because no vehicle moves like this.
 
     Two streams in millimetres agree with each other, so that only their motion reveals the unit.
 
     Parameters
     ----------
     parent, child : Trajectory
-        Both streams, with the child's lengths multiplied by the scale if it is known.
+        Both streams. The child's lengths contain the scale factor, if it is known.
     lever_arm_m : float
         Lower limit of the distance between the sensors, m; 0 if it is unknown.
     """
@@ -407,10 +408,10 @@ def check_lengths(
 
 
 def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
-    """Return the name of the unit in which a motion is usual, and the size of that unit in metres.
+    """Return the unit in which a motion is usual: its name and its size in metres.
 
-    The size is that of millimetres if both millimetres and centimetres are possible. The arguments
-    are computed as if lengths were in metres: a speed (m/s) and a change of velocity in a second.
+    If millimetres and centimetres are both possible, the size is that of millimetres. ``speed``
+    (m/s) and the change of velocity within a second are computed as if lengths were in metres.
     """
     if speed * 0.01 >= _FASTEST or change * 0.01 > _MOST_USUAL:
         return "millimetres", 0.001
@@ -422,8 +423,8 @@ def _unit_of_motion(speed: float, change: float) -> tuple[str, float]:
 def is_too_fast(trajectory: Trajectory, lever_arm_m: float = 0.0) -> bool:
     """Return whether a motion is too fast for any vehicle, so that lengths are not in metres.
 
-    The limit is lower for large vehicles. The lever arm between the sensors is a lower limit of the
-    size of the vehicle.
+    The limit is lower for large vehicles. The distance between the sensors is a lower limit of the
+    size.
     """
     speed, change = _usual_motion(trajectory)
     hardest = _HARDEST_OF_LARGE if lever_arm_m >= _LONG_LEVER_M else _HARDEST
@@ -439,8 +440,8 @@ def is_too_slow(trajectory: Trajectory) -> bool:
 def _usual_motion(trajectory: Trajectory) -> tuple[float, float]:
     """Return the usual speed (m/s) and the usual change of velocity within a second (m/s^2).
 
-    Both are quantiles that nine tenths of all seconds do not exceed. They are zero for a stream of
-    fewer than four seconds.
+    Nine tenths of all seconds have smaller values. Both values are zero for streams shorter than
+    four seconds.
     """
     seconds = coarse(trajectory, _STEP_S)
     if len(seconds) < 4:

@@ -1,4 +1,4 @@
-"""Detection of lengths in another unit than metres, by the scale between two streams."""
+"""Detect lengths in another unit than metres from the scale between two streams."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,7 @@ from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 
-# Names of the units of length that are detected, by their size in metres.
+# Names of the detected units of length, by their size in metres.
 _UNITS = {
     1e-3: "millimetres",
     1e-2: "centimetres",
@@ -14,16 +14,15 @@ _UNITS = {
     0.3048: "feet",
 }
 
-# A scale equals a unit if their difference is within the largest of two limits.
-# Limit in standard deviations of the scale.
+# A scale equals a unit if their difference is below the largest of the next limits. Limit in
+# standard deviations of the scale.
 UNIT_SIGMAS = 3.0
-# Limit for a unit of the child, as a share of the unit: rounding of data without noise.
+# Limit for a unit of the child, as a share of the unit. It covers rounding in data without noise.
 _UNIT_ROUNDING = 1e-6
-# Limit for a unit of the parent, as a share of the unit. Noise of the child biases the scale: by
-# 0.2 % for simulated arms, which is several standard deviations.
+# Limit for a unit of the parent, as a share of the unit. It covers the bias of the scale by noise
+# of the child: 0.2 % for simulated arms, which is several standard deviations.
 _PARENT_UNIT_SHARE = 0.005
-# A scale whose difference from a unit is within this share of the unit may be that unit times a
-# scale error of the odometry.
+# A scale within this share of a unit may be that unit times a scale error of the odometry.
 _NEAR_UNIT_SHARE = 0.05
 
 
@@ -36,16 +35,17 @@ def in_other_units(
 ) -> Finding | None:
     """Return the finding that a stream's lengths are in another unit, or None.
 
-    A scale below 1 that is within three standard deviations of a unit means that the child is in
-    that unit. Any other scale below 1 is a scale error of the child.
+    A scale below 1 and within three standard deviations of a unit means that the child has that
+    unit. Any other scale below 1 is a scale error of the child.
 
-    A scale above 1 near the inverse of a unit has two explanations: the parent is in that unit, or
-    the child's lengths have an unknown scale, such as those of a single camera. The motion decides:
+    A scale above 1 near the inverse of a unit has two explanations: the parent has that unit, or
+    the child has an unknown scale, like a single camera. The motion decides:
 
-    - A parent that would be too fast in metres is in that unit.
-    - A child that would hardly move in metres has an unknown scale.
+    - The parent has that unit if it would be too fast in metres.
+    - The child has an unknown scale if it would hardly move in metres.
     - If both motions are plausible in metres, the finding names both explanations. It is an error
-      within three standard deviations or 0.5 % of a unit, and a warning within 5 %.
+      if the scale is within three standard deviations or 0.5 % of the inverse unit, and a warning
+      within 5 %.
 
     Two streams in the same wrong unit have the ratio 1:
     :func:`~hand_eye_calib.core.checks.streams.check_lengths` detects them.
@@ -53,15 +53,15 @@ def in_other_units(
     Parameters
     ----------
     scale, sigma : float
-        Estimated factor of the child's lengths, after they were multiplied by ``known``, and the
-        standard deviation of the factor.
+        Estimated factor of the child's lengths in addition to ``known``, and its standard
+        deviation.
     parent, child : Trajectory
-        Streams as they were recorded, not multiplied by ``known``.
+        Recorded streams, without the factor ``known``.
     known : float
-        Factor of the child's lengths that the user stated.
+        Factor of the child's lengths that the user gave.
     """
-    # A known factor near 1 may come from an earlier solve of the same streams. Then the product of
-    # both factors is compared first.
+    # If the given factor is near 1, it may come from an earlier solve of the same streams. Try the
+    # product of both factors first in this case.
     totals = (scale * known, scale) if 0.5 < known < 2.0 else (scale,)
     for total in totals:
         values: dict[str, Any] = {
@@ -79,7 +79,7 @@ def in_other_units(
 
 
 class _Unit(NamedTuple):
-    """A unit of length (m), and whether a scale equals the unit within its uncertainty."""
+    """Unit of length (m), and whether a scale equals the unit within its uncertainty."""
 
     size_m: float
     is_exact: bool
@@ -104,9 +104,9 @@ def _unit_of(total: float, sigma: float) -> _Unit | None:
 def _parent_or_child(
     unit: _Unit, values: dict[str, Any], parent: Trajectory, child: Trajectory
 ) -> Finding | None:
-    """Return the finding about a parent that may be in a unit, because the scale is its inverse.
+    """Return the finding that the parent may have a unit, because the scale is the inverse of it.
 
-    The result is None if the child is too slow for lengths in metres: its scale is unknown.
+    The result is None if the child would be too slow in metres: its scale is then unknown.
     """
     if is_too_fast(parent) and not is_too_fast(child):
         options = {"parent_scale": unit.size_m}

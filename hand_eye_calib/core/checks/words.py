@@ -1,4 +1,4 @@
-"""Sentences of the stream checks: one row per finding, filled with the values of the finding."""
+"""Texts of the findings of the stream checks, filled with the values of the finding."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,23 @@ from hand_eye_calib.core.results.records import AS_WRITTEN, Severity
 
 @dataclass(frozen=True)
 class FindingWords:
-    """Templates of a finding.
+    """Texts of a finding, with the values of the finding in braces.
 
-    All texts may name the values of the finding in braces. Every finding has ``{stream}`` (parent,
-    child or both) and ``{whose}`` ("the child stream's").
+    Every finding also has ``{stream}`` (parent, child or both) and ``{whose}`` ("the child
+    stream's").
 
     Attributes
     ----------
     what : str
-        What was found.
+        Description of the fault.
     advice : str
-        What to do.
+        Advice to the user.
     cause : str
-        Usual cause, if ``what`` does not name it.
+        Usual cause, if the description does not name it.
     severity : Severity
-        Severity unless the check states another.
+        Severity, unless the check returns another one.
     code : str
-        Public code; empty if it is the key of the row.
+        Public code of the finding; empty if the key of the row is the code.
     """
 
     what: str
@@ -33,18 +33,18 @@ class FindingWords:
     code: str = ""
 
 
-#: What to do about streams that do not agree.
+#: Advice for streams that do not agree.
 UNRELATED_ADVICE = (
     "check that both sensors are on one rigid body, and that both streams are of one recording and "
     "in known units; if the clocks differ, have the offset estimated (time_offset estimate); if a "
     "file has angles clockwise from north, name them heading, not yaw"
 )
 
-#: Words of the findings of the core, by the key of the finding.
+#: Texts of the findings of the core, by the key of the finding.
 WORDS = {
-    # The sentences of documents without values.
+    # Findings whose complete texts come from a document.
     AS_WRITTEN: FindingWords("{what}", "{advice}", "{cause}"),
-    # Of one stream.
+    # Findings about one stream.
     "disorder": FindingWords(
         "{text}", "repair the source of the stamps", severity=Severity.NOTE
     ),
@@ -110,7 +110,7 @@ WORDS = {
         "give all lengths in metres, those of a file also by the unit in its header, such as "
         "x_mm; {condition}solve with",
     ),
-    # Of both streams together.
+    # Findings about both streams.
     "unrelated": FindingWords(
         "the streams agree at no clock offset: {doubt}",
         UNRELATED_ADVICE,
