@@ -1,6 +1,6 @@
 """Fourteen live sessions of the real node: do all surfaces agree, second by second?
 
-    OMP_NUM_THREADS=1 python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY]
+    python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY] [--seed SEED]
 
 Twelve sessions are a minute or two of simulated driving, published in real time, with one accident
 (a knock, a stream that stops, a wrong ``installed`` ...). Two are ten minutes of a vehicle that
@@ -71,7 +71,7 @@ from hand_eye_calib.online.watch.board import Board, state_of  # noqa: E402
 from reproduction.coverage.classes import CLASSES, simulate  # noqa: E402
 from reproduction.coverage.motions import RAMP_PERIOD_S, agv_on_request  # noqa: E402
 
-# Seed of the drives.
+# Seed of the drive of the first session; the next session has the next seed.
 SEED = 5800
 
 # Time (s) after a state within which the page must display it: the page looks every 0.25 s, and
@@ -906,6 +906,12 @@ def main():
     parser.add_argument(
         "--out", type=Path, help="directory for logs, pages and headlines"
     )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=SEED,
+        help=f"seed of the first session's drive (default: {SEED})",
+    )
     arguments = parser.parse_args()
     for name in arguments.sessions:
         if name not in SESSIONS:
@@ -920,7 +926,7 @@ def main():
             folder = (scratch_or_out or Path(scratch)) / f"session_{number}"
             folder.mkdir(parents=True, exist_ok=True)
             (row, witness), problems = run(
-                name, SESSIONS[name], folder, SEED + number
+                name, SESSIONS[name], folder, arguments.seed + number
             )
             rows.append([name, *row, str(len(problems))])
             all_problems += [

@@ -19,7 +19,7 @@ JARGON = (
 # Verbs of next steps. Every screen that requires a person has one of them.
 STEPS = (
     "acknowledge|check|compare|continue|correct|drive|go on|keep moving|look|measure|mend|"
-    "move|read|recalibrate|record|remove|reset|save|set|start|stop|tighten|wait|free|call"
+    "move|read|recalibrate|record|remove|reset|rotate|save|set|start|stop|tighten|tilt|wait|free|call"
 )
 
 # Times left: of the drive, and of the confirmation.

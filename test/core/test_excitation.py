@@ -101,8 +101,8 @@ def test_after_turns_about_all_axes_only_what_a_result_says_is_missing():
         observability_measured=(*result.observability_measured[:5], hidden),
     )
     assert excitation.what_is_missing(seen_in(poses), hiding) == (
-        "the rotation about z cannot be determined from the motion so far: rotations about y help "
-        "most"
+        "the rotation about z cannot be determined from the motion so far: rotate the sensors more "
+        "about y"
     )
 
 
@@ -117,7 +117,8 @@ def test_an_arm_is_not_told_to_drive():
         "it by hand"
     )
     assert (
-        excitation.helpful_motion(["x"], seen) == "rotations about y help most"
+        excitation.helpful_motion(["x"], seen)
+        == "rotate the sensors more about y"
     )
     still = seen_in(
         se3.from_rotation_translation(np.tile(np.eye(3), (400, 1, 1)), path)

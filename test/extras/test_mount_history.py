@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
@@ -199,28 +199,100 @@ def test_compare_prints_the_history_of_a_folder(session, tmp_path, capsys):
         compare_digests(arguments(tmp_path, installed="robot.urdf"))
 
 
-def test_an_alarm_within_a_session_is_printed_and_is_no_good_exit(
+def knocked(session):
+    """Digest of a session in which the sensor is turned about z by 1.5 deg after 400 s."""
+    monitor = MountMonitor(MOUNT, np.zeros((6, 6)))
+    pairs = forklift(600.0, seed=2)
+    is_later = pairs.stamps_ns >= START_NS + 400_000_000_000
+    child = pairs.Ts_cw_c.copy()
+    child[is_later] = child[is_later] @ se3.exp(about_parent("z", 1.5))
+    monitor.add(PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child))
+    digest = monitor.digest("lidar", "camera")
+    # Of the same mount as the other sessions: their covariances are those of one drive.
+    return dataclasses.replace(
+        digest, covariance=session.covariance, wander=session.wander
+    )
+
+
+def test_a_session_with_an_alarm_is_divided_at_the_shift(session):
+    digest = knocked(session)
+    since_s = (digest.since_ns - START_NS) * 1e-9
+    assert since_s == pytest.approx(400.0, abs=10.0)
+    before, since = digest.parts()
+    assert (before.alarm, since.alarm) == ("", digest.alarm)
+    assert before.start_ns == digest.start_ns
+    assert before.end_ns == since.start_ns == digest.since_ns
+    assert before.seconds + since.seconds == digest.seconds
+    assert_allclose(before.evidence + since.evidence, digest.evidence)
+    offsets = History.of([digest]).offsets
+    assert len(offsets) == 2
+    assert abs(offsets[0].axes["yaw"].difference) < np.radians(0.2)
+    row = offsets[1].axes["yaw"]
+    assert row.difference == pytest.approx(np.radians(1.5), abs=3.3 * row.sigma)
+
+
+def test_a_mount_that_had_moved_before_the_session_has_one_part():
+    monitor = MountMonitor(MOUNT, np.zeros((6, 6)))
+    pairs = forklift(600.0, seed=3)
+    child = pairs.Ts_cw_c @ se3.exp(about_parent("z", 1.5))
+    monitor.add(PosePairs(pairs.stamps_ns, pairs.Ts_pw_p, child))
+    digest = monitor.digest("lidar", "camera")
+    assert digest.alarm
+    assert digest.parts() == [digest]
+    assert_array_equal(digest.evidence_since, digest.evidence)
+
+
+def test_the_row_of_a_vehicle_has_the_time_of_its_shift(
+    session, tmp_path, capsys
+):
+    others = [
+        dataclasses.replace(digest, start_ns=digest.start_ns - 5 * WEEK_NS)
+        for digest in weeks(session, 5, n_weeks=4)
+    ]
+    digest = knocked(session)
+    for item in (*others, digest):
+        write_digest(tmp_path, item)
+    assert compare_digests(arguments(tmp_path)) == 4
+    lines = capsys.readouterr().out.splitlines()
+    shifted_day = digest.parts()[1].day
+    assert shifted_day > digest.day
+    assert f": moved at {shifted_day}: " in lines[0]
+    assert lines[0].endswith("(5 sessions)")
+    # The session has a row before the shift and one since it.
+    assert lines[-3].startswith(f"  {digest.day}")
+    assert lines[-2].startswith(f"  -- moved at {shifted_day}: ")
+    assert lines[-1].startswith(f"  {shifted_day}")
+    document = History.of([*others, digest]).document()
+    assert len(document["sessions"]) == 5
+    assert [*document["alarms"]] == [shifted_day]
+
+
+def test_an_alarm_of_a_session_is_printed_and_is_no_good_exit(
     session, tmp_path, capsys
 ):
     *others, last = weeks(session, 5, np.zeros(6), since=6, n_weeks=4)
     for digest in (
         *others,
-        dataclasses.replace(last, alarm="moved about z by 1.5 deg"),
+        dataclasses.replace(last, alarm="about z by 1.5 deg"),
     ):
         write_digest(tmp_path, digest)
     assert compare_digests(arguments(tmp_path)) == 4
     lines = capsys.readouterr().out.splitlines()
-    assert (
-        f"alarm in the session of {last.day}: moved about z by 1.5 deg"
-        in lines[0]
-    )
-    assert lines[-2:] == [
-        "  -- alarm in this session: moved about z by 1.5 deg",
-        "     (the offset above is of the whole session, also before the alarm)",
-    ]
+    assert f"alarm at {last.day}: about z by 1.5 deg" in lines[0]
+    assert lines[-2] == f"  -- alarm at {last.day}: about z by 1.5 deg"
     assert compare_digests(arguments(tmp_path, json=True)) == 4
     alarms = json.loads(capsys.readouterr().out)["alarms"]
-    assert alarms == {last.day: "moved about z by 1.5 deg"}
+    assert alarms == {last.day: "about z by 1.5 deg"}
+
+
+def test_an_alarm_that_repeats_an_earlier_shift_is_no_new_event(session):
+    digests = weeks(session, 912, about_parent("z", 0.6), since=3, n_weeks=8)
+    digests[6] = dataclasses.replace(digests[6], alarm="about z by 0.6 deg")
+    history = History.of(digests)
+    assert [event.index for event in history.events] == [3]
+    digests[1] = dataclasses.replace(digests[1], alarm="about z by 0.2 deg")
+    kinds = [event.is_change for event in History.of(digests).events]
+    assert kinds == [False, True]
 
 
 def test_other_files_are_left_to_compare_and_unusable_digests_are_named(
@@ -255,7 +327,7 @@ def write_fleet(session, folder):
         digests = weeks(session, seed, shift)
         if vehicle == "forklift_3":
             digests[-1] = dataclasses.replace(
-                digests[-1], alarm="moved about z by 1.5 deg"
+                digests[-1], alarm="about z by 1.5 deg"
             )
         for digest in digests:
             write_digest(folder / vehicle, digest)
@@ -277,7 +349,7 @@ def test_the_page_of_a_fleet_has_the_history_of_each_vehicle(
         == "forklift_1: Mount of camera on lidar: no change in 100 sessions"
     )
     assert f"moved before {moved_week}" in second
-    assert "alarm in the session of" in third
+    assert "alarm at" in third
     html = page.read_text()
     assert "<h1>2 of 3 mounts to check</h1>" in html
     # The newest event comes first, and the vehicle that is well comes last.

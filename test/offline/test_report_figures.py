@@ -9,13 +9,15 @@ import pytest
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
+from matplotlib.figure import Figure
+
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.extras.simulation.demo import DRIVE
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import REALISTIC
 from hand_eye_calib.offline.report import evidence
 from hand_eye_calib.offline.report.figures import figures_of
-from hand_eye_calib.offline.report.style import LOOK
+from hand_eye_calib.offline.report.style import LOOK, recordings_axis
 
 
 def points_of(svg):
@@ -84,3 +86,22 @@ def test_the_turning_part_of_a_path_is_its_turn():
         np.cumsum(steps[:50], axis=0), times_s[:50], 10.0
     )
     assert short == slice(0, 50)
+
+
+@pytest.mark.parametrize(
+    ("starts_h", "hours"), [([0, 100], 110.0), ([0], 1.0), ([0, 0.2], 1.0)]
+)
+def test_an_axis_of_recordings_is_as_long_as_their_time(starts_h, hours):
+    panel = Figure().subplots()
+    stamps_ns = [round(hour * 3_600e9) for hour in starts_h]
+    days = recordings_axis([panel], stamps_ns, "recording")
+    first, last = panel.get_xlim()
+    assert 24 * (last - first) == pytest.approx(hours)
+    assert 24 * (days - days[0]) == pytest.approx(starts_h, abs=1e-4)
+
+
+def test_recordings_of_one_time_are_drawn_by_their_number():
+    panel = Figure().subplots()
+    places = recordings_axis([panel], [0, 0, 0], "recording")
+    assert places.tolist() == [1.0, 2.0, 3.0]
+    assert panel.get_xlabel() == "number of the recording"

@@ -199,7 +199,7 @@ def test_a_first_result_takes_20_s_of_motion_or_a_rotation_of_30_deg(
         (
             Answer(0, 0.1, seen(25.0, (0.5, 0.5, 90.0)), failure=Failure("no")),
             "x, y and z cannot be determined from the motion so far. "
-            "Tighter curves to both sides help most. Drive over a ramp",
+            "Drive tighter curves to both sides. Drive over a ramp",
         ),
         (
             Answer(

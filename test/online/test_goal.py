@@ -1,12 +1,14 @@
 """When a session is told to stop, and what it is told until then."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from result_making import calibration as made
 from result_making import seen
+from screen_rules import STEPS
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.excitation import excitation, helpful_motion
@@ -160,7 +162,7 @@ def test_time_left_follows_from_the_variance_that_falls_with_time():
     assert progress.limiting_axis == "y"
     assert_allclose(seconds_left(progress), [0, 120, 0, 0, 0, 0])
     assert progress.sentence == (
-        "Go on for about 4 min, y takes longest. Tighter curves to both sides help most."
+        "Go on for about 4 min, y takes longest. Drive tighter curves to both sides."
     )
 
 
@@ -343,15 +345,53 @@ def test_an_axis_that_stays_unobservable():
         ("y", (1, 1, 2), "move in curves, to both sides"),
         ("z", (1, 2, 90), ON_A_FLAT_FLOOR.lower()),
         ("y", (1, 90, 2), ON_A_FLAT_FLOOR.lower()),
-        ("x", (1, 2, 90), "tighter curves to both sides help most"),
-        ("roll", (1, 2, 90), "tighter curves to both sides help most"),
+        ("x", (1, 2, 90), "drive tighter curves to both sides"),
+        ("roll", (1, 2, 90), "drive tighter curves to both sides"),
         ("yaw", (1, 2, 90), "move farther, straight on and in curves"),
-        ("z", (20, 10, 90), "rotations about y help most"),
-        ("roll", (20, 40, 30), "rotations about z help most"),
+        ("z", (20, 10, 90), "rotate the sensors more about y"),
+        ("roll", (20, 40, 30), "rotate the sensors more about z"),
     ],
 )
 def test_motion_that_helps_is_about_another_axis(axis, rotation_deg, words):
     assert helpful_motion([axis], seen(40.0, rotation_deg)) == words
+
+
+@pytest.mark.parametrize(
+    ("axes", "rotation_deg", "words"),
+    [
+        (["x", "y"], (20, 10, 90), "rotate the sensors more about x and y"),
+        (["x", "z"], (20, 10, 90), "rotate the sensors more about y"),
+        (
+            ["x", "z"],
+            (1, 2, 90),
+            "drive tighter curves to both sides; " + ON_A_FLAT_FLOOR.lower(),
+        ),
+    ],
+)
+def test_advice_for_several_axes_is_joined(axes, rotation_deg, words):
+    assert helpful_motion(axes, seen(40.0, rotation_deg)) == words
+
+
+def test_advice_for_a_vehicle_names_the_manoeuvre_of_each_rotation():
+    motion = dataclasses.replace(
+        seen(40.0, (20, 10, 90)), forward=np.array([1.0, 0.0, 0.0])
+    )
+    assert motion.has_vehicle_axes
+    assert helpful_motion(["x", "y"], motion) == (
+        "drive one wheel over a kerb and drive over a ramp or a bump"
+    )
+    assert helpful_motion(["z"], motion) == "drive over a ramp or a bump"
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_every_advice_begins_with_what_to_do(axis):
+    for rotation_deg in ((1, 1, 2), (1, 2, 90), (20, 10, 90), (90, 90, 90)):
+        for drives in (True, False):
+            motion = dataclasses.replace(
+                seen(40.0, rotation_deg), drives=drives
+            )
+            verb = helpful_motion([axis], motion).partition(" ")[0]
+            assert re.fullmatch(STEPS, verb)
 
 
 def test_only_motion_counts_as_time():

@@ -11,7 +11,7 @@ from hand_eye_calib.core.assessment.covariance import (
 )
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import median, quantile
-from hand_eye_calib.core.base.text import axes_in_words
+from hand_eye_calib.core.base.text import axes_in_words, listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
@@ -42,9 +42,9 @@ _ALONG_ONE_AXIS = 0.9
 _LONG_STEP = 0.3
 # Manoeuvres that turn a vehicle about its x, y and z.
 _MANOEUVRES = (
-    "one wheel over a kerb",
-    "over a ramp or a bump",
-    "curves to both sides",
+    "drive one wheel over a kerb",
+    "drive over a ramp or a bump",
+    "drive curves to both sides",
 )
 
 # Advice about the height of a vehicle that has only turned about its vertical axis, and what a
@@ -229,9 +229,13 @@ def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
     seen : Excitation
         The motion so far.
     """
-    hints = [_motion_for(axis, seen) for axis in axes]
-    different_hints = dict.fromkeys(hints)
-    return "; ".join(different_hints)
+    motions = [_motion_for(axis, seen) for axis in axes]
+    rotations = {motion for motion in motions if isinstance(motion, int)}
+    others = [motion for motion in motions if isinstance(motion, str)]
+    hints = [*dict.fromkeys(others)]
+    if rotations:
+        hints.append(_rotations_in_words(sorted(rotations), seen))
+    return "; ".join(hints)
 
 
 def axes_by_hand(axes: Sequence[str], seen: Excitation) -> tuple[str, ...]:
@@ -257,8 +261,19 @@ def _turns_about_one_axis(seen: Excitation) -> bool:
     return int((seen.rotation < MIN_ROTATION).sum()) == 2
 
 
-def _motion_for(name: str, seen: Excitation) -> str:
-    """Describe the motion that reveals most about the axis ``name``."""
+def _rotations_in_words(rotations: Sequence[int], seen: Excitation) -> str:
+    """Return how to turn about axes, given by index."""
+    if seen.has_vehicle_axes:
+        return listing([_MANOEUVRES[index] for index in rotations])
+    names = ["xyz"[index] for index in rotations]
+    return f"rotate the sensors more about {listing(names)}"
+
+
+def _motion_for(name: str, seen: Excitation) -> int | str:
+    """Return the motion that reveals most about the axis ``name``.
+
+    A rotation about an axis is returned as the index of this axis, other motions as text.
+    """
     rotation = seen.rotation
     if rotation.max() < MIN_ROTATION:
         if seen.drives:
@@ -271,12 +286,8 @@ def _motion_for(name: str, seen: Excitation) -> str:
     if turns_about_one_axis and is_main:
         return _motion_for_only_axis(name, others, seen)
     if turns_about_one_axis and seen.drives:
-        return "tighter curves to both sides help most"
-    weakest = min(others, key=lambda other: rotation[other])
-    hint = f"rotations about {'xyz'[weakest]} help most"
-    if seen.has_vehicle_axes:
-        return f"{hint} ({_MANOEUVRES[weakest]})"
-    return hint
+        return "drive tighter curves to both sides"
+    return min(others, key=lambda other: float(rotation[other]))
 
 
 def _motion_for_only_axis(

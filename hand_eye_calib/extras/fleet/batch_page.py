@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
+from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import ABOUT, counted, listing, with_sigma
@@ -29,6 +29,7 @@ from hand_eye_calib.offline.report.style import (
     Drawn,
     as_drawn,
     page_style,
+    recordings_axis,
 )
 
 _AXES = {
@@ -113,23 +114,27 @@ def _trend(result: Calibration, number: int) -> Drawn:
     recordings = together.recordings if together else ()
     figure = Figure(figsize=(LOOK.width, _HEIGHT), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
+    starts_ns = [recording.stamp_ns for recording in recordings]
+    days = recordings_axis(panels, starts_ns, "recording")
     for axis, panel, sigma in zip(
         _AXES, panels, result.sigmas_measured, strict=True
     ):
-        _draw_axis(panel, axis, sigma, recordings)
-    locator = AutoDateLocator(minticks=2, maxticks=4)
-    panels[0].xaxis.set_major_locator(locator)
-    panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        _draw_axis(panel, axis, sigma, days, recordings)
     title = "Each recording against the common extrinsic"
     return as_drawn(figure, f"vehicle-{number}", title, _CAPTION)
 
 
 def _draw_axis(
-    panel: Any, axis: str, sigma: float, recordings: Sequence[Recorded]
+    panel: Any,
+    axis: str,
+    sigma: float,
+    days: FloatArray,
+    recordings: Sequence[Recorded],
 ) -> None:
     """Draw the differences of recordings from the common value of an axis (m or rad).
 
-    ``sigma`` is the measured standard deviation of the common value.
+    ``sigma`` is the measured standard deviation of the common value. ``days`` are the places of the
+    recordings on the x axis.
     """
     factor = 100.0
     unit = "cm"
@@ -138,10 +143,6 @@ def _draw_axis(
         factor = np.degrees(1.0)
         unit = "deg"
         title = f"about {ABOUT[axis]}"
-    stamps_ns = np.array(
-        [recording.stamp_ns for recording in recordings], dtype="datetime64[ns]"
-    )
-    days = date2num(stamps_ns)
     is_apart = np.array([bool(recording.left_out) for recording in recordings])
     points = [
         (recording.deviations[axis], recording.sigmas[axis])

@@ -103,14 +103,12 @@ def _lines(history: History) -> Iterator[str]:
         f"{key.replace('_', ' '):>{_WIDTH}}" for key in AXIS_KEYS.values()
     )
     yield f"  {'session':<18}{'motion':>8}{names}"
-    by_index = {
-        changepoint.index: changepoint for changepoint in history.changes
-    }
+    events = {event.index: event for event in history.events}
     for index, (digest, offset) in enumerate(
         zip(history.digests, history.offsets, strict=True)
     ):
-        if changepoint := by_index.get(index):
-            yield f"  -- moved before {digest.day}: {changepoint.shift.what}"
+        if event := events.get(index):
+            yield f"  -- {event.when}: {event.what}"
         cells = [
             f"{amount(axis, row.difference)} +/- {amount(axis, row.sigma)}"
             for axis, row in offset.axes.items()
@@ -118,6 +116,3 @@ def _lines(history: History) -> Iterator[str]:
         yield f"  {digest.day:<18}{digest.seconds:>6} s" + "".join(
             f"{cell:>{_WIDTH}}" for cell in cells
         )
-        if digest.alarm:
-            yield f"  -- alarm in this session: {digest.alarm}"
-            yield "     (the offset above is of the whole session, also before the alarm)"

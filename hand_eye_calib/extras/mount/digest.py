@@ -6,7 +6,7 @@ divided by the long-run variance of the scores, so that H and S of several sessi
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ _SHAPES = {
     "covariance": (6, 6),
     "wander": (6, 6),
     "evidence": (6, 7),
+    "evidence_since": (6, 7),
 }
 
 # Larger files (bytes) are not read, because they are no digests.
@@ -58,6 +59,12 @@ class Digest:
         Information H and score S, ``[H S]``, on a shift in the child's frame.
     alarm : str
         Text of the monitor's alarm; empty without an alarm.
+    since_ns : int
+        Approximate time of the shift that raised the alarm (ns); 0 without an alarm.
+    seconds_since : int
+        Duration of the motion since this time (s).
+    evidence_since : (6, 7) array
+        Part of the evidence since this time.
     """
 
     parent_frame: str
@@ -70,10 +77,37 @@ class Digest:
     wander: FloatArray
     evidence: FloatArray
     alarm: str = ""
+    since_ns: int = 0
+    seconds_since: int = 0
+    evidence_since: FloatArray = field(default_factory=lambda: np.zeros((6, 7)))
+
+    def parts(self) -> "list[Digest]":
+        """Return the session, divided at the shift that raised its alarm.
+
+        The part since the shift has the alarm. A session whose shift is at its start has one part.
+        """
+        n_before = self.seconds - self.seconds_since
+        if not self.since_ns or n_before <= 0:
+            return [self]
+        before = replace(
+            self,
+            end_ns=self.since_ns,
+            seconds=n_before,
+            evidence=self.evidence - self.evidence_since,
+            alarm="",
+            since_ns=0,
+        )
+        since = replace(
+            self,
+            start_ns=self.since_ns,
+            seconds=self.seconds_since,
+            evidence=self.evidence_since,
+        )
+        return [before, since]
 
     @property
     def day(self) -> str:
-        """Date and time of the session's start (UTC), as text."""
+        """Date and time of the first motion (UTC), as text."""
         start = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
         return start.strftime("%Y-%m-%d %H:%M")
 
@@ -114,11 +148,9 @@ def read_digest(path: Path) -> Digest | None:
         return None
     try:
         for name, shape in _SHAPES.items():
-            document[name] = np.array(document[name], dtype=float)
-            if (
-                document[name].shape != shape
-                or not np.isfinite(document[name]).all()
-            ):
+            values = np.array(document[name], dtype=float)
+            document[name] = values
+            if values.shape != shape or not np.isfinite(values).all():
                 raise ValueError(f"{name} must be {shape} finite numbers")
         digest: Digest = from_plain(Digest, document)
     except (KeyError, TypeError, ValueError) as error:

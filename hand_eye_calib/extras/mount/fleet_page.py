@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from hand_eye_calib.core.assessment import change
@@ -24,6 +23,7 @@ from hand_eye_calib.offline.report.style import (
     Drawn,
     as_drawn,
     page_style,
+    recordings_axis,
 )
 
 # Height of the figure of a vehicle, inches.
@@ -38,9 +38,8 @@ _DETERMINED = 0.3
 _CAPTION = (
     "Offset from the installed pose along and about the parent's axes, from all sessions since the "
     "last change. The band is three standard deviations; it shrinks with the sessions. A dashed "
-    "line is a change of the mount, a dotted line an alarm within a session. The offset of such a "
-    "session is of the whole session, also before the alarm. An axis that the motion does not "
-    "determine has no line."
+    "line is a change of the mount, a dotted line an alarm that the history does not confirm. An "
+    "axis that the motion does not determine has no line."
 )
 
 
@@ -91,7 +90,7 @@ def render_fleet(histories: Mapping[str, History]) -> str:
         sentence,
         rows=rows,
         vehicles=[
-            (row, _change_rows(history), _precision(history), figure)
+            (row, history.events, _precision(history), figure)
             for row, (_, history), figure in zip(
                 rows, ordered, figures, strict=False
             )
@@ -101,53 +100,22 @@ def render_fleet(histories: Mapping[str, History]) -> str:
 
 
 def _row(name: str, history: History) -> _Row:
-    """Return the row of a vehicle: its newest change, else its newest alarm."""
-    digests = history.digests
-    newest = digests[-1].day
-    if history.changes:
-        newest_change = history.changes[-1]
-        day = digests[newest_change.index].day
-        what = newest_change.shift.what
-        return _Row(name, "bad", "MOVED", day, what, len(digests), newest)
-    alarms = [digest for digest in digests if digest.alarm]
-    if alarms:
-        return _Row(
-            name,
-            "bad",
-            "ALARM",
-            alarms[-1].day,
-            alarms[-1].alarm,
-            len(digests),
-            newest,
-        )
-    return _Row(name, "good", "NOT MOVED", "", "", len(digests), newest)
-
-
-def _change_rows(history: History) -> list[tuple[str, str]]:
-    """Return day and text of each change and alarm, in order of time."""
-    digests = history.digests
-    events = [
-        (
-            digests[item.index].start_ns,
-            f"moved before {digests[item.index].day}",
-            item.shift.what,
-        )
-        for item in history.changes
-    ]
-    events += [
-        (digest.start_ns, f"alarm in the session of {digest.day}", digest.alarm)
-        for digest in digests
-        if digest.alarm
-    ]
-    return [(when, what) for _, when, what in sorted(events)]
+    """Return the row of a vehicle, with its newest change or alarm."""
+    n_sessions = len(history.sessions)
+    newest = history.sessions[-1].day
+    if not history.events:
+        return _Row(name, "good", "NOT MOVED", "", "", n_sessions, newest)
+    event = history.events[-1]
+    word = "MOVED" if history.changes else "ALARM"
+    return _Row(name, "bad", word, event.day, event.what, n_sessions, newest)
 
 
 def _precision(history: History) -> list[tuple[str, str, str]]:
     """Return, per axis, the standard deviation of the offset after the first and the last session.
 
-    These are sessions since the last change.
+    These are sessions since the last change or alarm.
     """
-    first = history.offsets[history.changes[-1].index if history.changes else 0]
+    first = history.offsets[max(history.cuts, default=0)]
     last = history.offsets[-1]
     return [
         (
@@ -164,20 +132,14 @@ def _figure(history: History, number: int) -> Drawn:
     """Draw the offset of each axis over time; ``number`` is that of the vehicle on the page."""
     figure = Figure(figsize=(LOOK.width, _HEIGHT), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True).ravel()
-    days = _days([digest.start_ns for digest in history.digests])
-    cuts = [changepoint.index for changepoint in history.changes]
-    alarms = [
-        index for index, digest in enumerate(history.digests) if digest.alarm
-    ]
+    starts_ns = [digest.start_ns for digest in history.digests]
+    days = recordings_axis(panels, starts_ns, "session")
+    cuts = sorted(history.cuts)
     for axis, panel in zip(AXES, panels, strict=True):
         _draw_axis(panel, axis, days, history.offsets, cuts)
-        for index in cuts:
-            panel.axvline(days[index], color=BAD, lw=1.0, ls="--")
-        for index in alarms:
-            panel.axvline(days[index], color=BAD, lw=1.0, ls=":")
-    locator = AutoDateLocator(minticks=2, maxticks=4)
-    panels[0].xaxis.set_major_locator(locator)
-    panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        for event in history.events:
+            style = "--" if event.is_change else ":"
+            panel.axvline(days[event.index], color=BAD, lw=1.0, ls=style)
     return as_drawn(
         figure, f"mount-{number}", "Offset from the installed pose", _CAPTION
     )
@@ -220,9 +182,3 @@ def _draw_axis(
             marker="." if len(part) == 1 else "",
         )
     panel.tick_params(axis="y", colors=MUTED)
-
-
-def _days(stamps_ns: Sequence[int]) -> FloatArray:
-    """Return stamps (ns) as the days of Matplotlib."""
-    days: FloatArray = date2num(np.array(stamps_ns, dtype="datetime64[ns]"))
-    return days

@@ -11,7 +11,7 @@ are then searched for further changes (binary segmentation: A. Scott, M. Knott, 
 method*, 1974).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,75 +56,114 @@ class Changepoint:
 
 
 @dataclass(frozen=True)
+class Event:
+    """A change of the mount or an alarm of the monitor.
+
+    Attributes
+    ----------
+    index : int
+        Index of the first digest since the event.
+    is_change : bool
+        Whether the history contains a change; otherwise only the monitor has raised an alarm.
+    day : str
+        Date and time (UTC): of the shift, or of the first session after it.
+    when : str
+        Kind and time of the event in words.
+    what : str
+        Axes that have moved, and by how much.
+    """
+
+    index: int
+    is_change: bool
+    day: str
+    when: str
+    what: str
+
+
+@dataclass(frozen=True)
 class History:
     """History of one mount.
 
     Attributes
     ----------
-    digests : sequence of Digest
+    sessions : sequence of Digest
         In order of time.
+    digests : sequence of Digest
+        The same; a session in which the mount has moved is divided at the time of the shift.
+    cuts : set of int
+        Indices of digests from which on a new offset is estimated.
     changes : sequence of Changepoint
         In order of time.
     offsets : sequence of Moved
-        For each session, the offset from the installed pose by all sessions since the last change,
-        along and about the axes of the parent sensor's frame.
+        For each digest, the offset from the installed pose by all digests since the last of the
+        cuts, along and about the axes of the parent sensor's frame.
     """
 
+    sessions: Sequence[Digest]
     digests: Sequence[Digest]
+    cuts: Set[int]
     changes: Sequence[Changepoint]
     offsets: Sequence[change.Moved]
 
     @classmethod
-    def of(cls, digests: Sequence[Digest]) -> "History":
+    def of(cls, sessions: Sequence[Digest]) -> "History":
         """Return the history of the sessions with these digests."""
+        digests: list[Digest] = []
+        cuts = set()
+        for session in sessions:
+            first, *later = session.parts()
+            digests.append(first)
+            if later:
+                cuts.add(len(digests))
+            digests += later
         changes = find_changes(digests)
-        cuts = {changepoint.index for changepoint in changes}
-        offsets = []
-        evidence = np.zeros((6, 7))
-        for index, digest in enumerate(digests):
-            if index in cuts:
-                evidence = np.zeros((6, 7))
-            # All sessions since the last change have the same offset, so their evidence is added.
-            evidence = evidence + _evidence_on_common_offset(digest)
-            to_parent = se3.block_diagonal(se3.rotation_of(digest.installed))
-            offsets.append(_shift_of(evidence, to_parent))
-        return cls(digests, changes, offsets)
+        cuts |= {changepoint.index for changepoint in changes}
+        return cls(sessions, digests, cuts, changes, _offsets(digests, cuts))
 
     @property
     def has_moved(self) -> bool:
         """Whether there is a change between sessions, or an alarm within one."""
-        return bool(self.changes) or any(
-            digest.alarm for digest in self.digests
-        )
+        return bool(self.events)
+
+    @property
+    def events(self) -> list[Event]:
+        """Changes and alarms in order of time.
+
+        An alarm that is a change is listed once. An alarm that only repeats an earlier event,
+        because the mount had moved before the session, is not listed.
+        """
+        changes = {item.index: item for item in self.changes}
+        events = []
+        for index, digest in enumerate(self.digests):
+            if index in changes:
+                # Only the monitor knows the time of a shift within a session.
+                place = "at" if digest.alarm else "before"
+                when = f"moved {place} {digest.day}"
+                what = changes[index].shift.what
+                events.append(Event(index, True, digest.day, when, what))
+            elif digest.alarm and (index in self.cuts or not events):
+                when = f"alarm at {digest.day}"
+                events.append(
+                    Event(index, False, digest.day, when, digest.alarm)
+                )
+        return events
 
     @property
     def newest_event_ns(self) -> int:
-        """Start of the newest session with a change or an alarm (ns); 0 without any."""
-        changed = [
-            self.digests[changepoint.index].start_ns
-            for changepoint in self.changes
-        ]
-        alarmed = [digest.start_ns for digest in self.digests if digest.alarm]
-        return max(changed + alarmed, default=0)
+        """Time of the newest change or alarm (ns); 0 without any."""
+        events = self.events
+        return self.digests[events[-1].index].start_ns if events else 0
 
     @property
     def sentence(self) -> str:
-        """The verdict in one line, with the newest change."""
-        first = self.digests[0]
+        """The verdict in one line, with the newest change or alarm."""
+        first = self.sessions[0]
         mount = f"Mount of {first.child_frame} on {first.parent_frame}"
-        sessions = counted(len(self.digests), "session")
-        alarms = [digest for digest in self.digests if digest.alarm]
-        if self.changes:
-            newest = self.changes[-1]
-            day = self.digests[newest.index].day
-            return (
-                f"{mount}: moved before {day}: {newest.shift.what} ({sessions})"
-            )
-        if alarms:
-            # The monitor compares within a session, where the sessions as a whole may agree.
-            alarm = alarms[-1]
-            return f"{mount}: alarm in the session of {alarm.day}: {alarm.alarm} ({sessions})"
-        return f"{mount}: no change in {sessions}"
+        sessions = counted(len(self.sessions), "session")
+        if not self.events:
+            return f"{mount}: no change in {sessions}"
+        newest = self.events[-1]
+        return f"{mount}: {newest.when}: {newest.what} ({sessions})"
 
     def document(self) -> dict[str, Any]:
         """Return days of sessions, changes and alarms as plain values."""
@@ -137,7 +176,7 @@ class History:
             for item in self.changes
         ]
         return {
-            "sessions": [digest.day for digest in self.digests],
+            "sessions": [digest.day for digest in self.sessions],
             "changes": plain(rows),
             "alarms": {
                 digest.day: digest.alarm
@@ -145,6 +184,20 @@ class History:
                 if digest.alarm
             },
         }
+
+
+def _offsets(digests: Sequence[Digest], cuts: Set[int]) -> list[change.Moved]:
+    """Return the offset from the installed pose at each digest, see :class:`History`."""
+    offsets = []
+    evidence = np.zeros((6, 7))
+    for index, digest in enumerate(digests):
+        if index in cuts:
+            evidence = np.zeros((6, 7))
+        # All digests since the last cut have the same offset, so their evidence is added.
+        evidence = evidence + _evidence_on_common_offset(digest)
+        to_parent = se3.block_diagonal(se3.rotation_of(digest.installed))
+        offsets.append(_shift_of(evidence, to_parent))
+    return offsets
 
 
 def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:

@@ -156,6 +156,8 @@ class Alarm:
         Approximate time of the shift, on the parent's clock.
     raised_ns : int
         Time of its detection, on the parent's clock.
+    seconds_before : int
+        Duration of the motion before the shift (s); 0 if the mount had moved before all motion.
     shift : Moved
         Shift along and about the axes of the parent sensor's frame.
     log_ratio : float
@@ -164,6 +166,7 @@ class Alarm:
 
     since_ns: int
     raised_ns: int
+    seconds_before: int
     shift: change.Moved
     log_ratio: float
 
@@ -415,9 +418,13 @@ class MountMonitor:
         if self.alarm:
             self.alarm = replace(self.alarm, shift=shift, log_ratio=log_ratio)
             return
+        is_since_the_start = best == len(lags) - 1
         self.alarm = Alarm(
             since_ns=int(self._stamps_ns[-lags[best]]),
             raised_ns=int(self._stamps_ns[-1]),
+            seconds_before=0
+            if is_since_the_start
+            else self.seconds - int(lags[best]),
             shift=shift,
             log_ratio=log_ratio,
         )
@@ -452,7 +459,7 @@ class MountMonitor:
         """Return the digest of the session; None until the noise is estimated."""
         if self.is_learning:
             return None
-        return Digest(
+        digest = Digest(
             parent_frame=parent_frame,
             child_frame=child_frame,
             start_ns=self._start_ns,
@@ -462,7 +469,22 @@ class MountMonitor:
             covariance=self._covariance,
             wander=self._wander,
             evidence=(self._old + self._seconds.total) / self.long_run,
-            alarm=str(self.alarm) if self.alarm else "",
+        )
+        alarm = self.alarm
+        if alarm is None:
+            return digest
+        n_since = self.seconds - alarm.seconds_before
+        evidence_since = digest.evidence
+        if alarm.seconds_before:
+            # The memory contains at least the newest of these seconds.
+            newest = self._seconds.sums[-n_since:]
+            evidence_since = newest.sum(axis=0) / self.long_run
+        return replace(
+            digest,
+            alarm=alarm.shift.what,
+            since_ns=alarm.since_ns,
+            seconds_since=n_since,
+            evidence_since=evidence_since,
         )
 
     def visible(self, seconds: float) -> FloatArray:

@@ -13,9 +13,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 
@@ -220,6 +224,46 @@ def as_drawn(
 def _name_of(line: Any) -> str:
     """Return the name that :func:`plain_label` has made the label of a line."""
     return str(line.get_label()).replace(r"\$", "$").removeprefix("\u200b")
+
+
+# Shortest time on an axis of recordings (days). Recordings whose starts are within the second time
+# (days) would be drawn at the same place.
+_SHORTEST_AXIS_DAYS = 1.0 / 24.0
+_SAME_TIME_DAYS = 1.0 / 1440.0
+
+
+def recordings_axis(
+    panels: Sequence[Axes], stamps_ns: Sequence[int], name: str
+) -> FloatArray:
+    """Return the places (N,) of recordings on the x axis of panels that share it, and label it.
+
+    The axis is the time from the first to the last start. It has the number of each recording if
+    all starts are within a minute.
+
+    Parameters
+    ----------
+    panels : sequence of Axes
+    stamps_ns : sequence of int
+        Start of each recording (ns), in order of time.
+    name : str
+        What a number counts, such as "recording".
+    """
+    days = date2num(np.array(stamps_ns, dtype="datetime64[ns]"))
+    first = float(days.min(initial=np.inf))
+    last = float(days.max(initial=-np.inf))
+    if len(days) > 1 and last - first < _SAME_TIME_DAYS:
+        panels[0].xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        panels[-1].set_xlabel(f"number of the {name}")
+        return np.arange(1.0, len(days) + 1.0)
+    locator = AutoDateLocator(minticks=2, maxticks=4)
+    panels[0].xaxis.set_major_locator(locator)
+    panels[0].xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    if len(days):
+        # The margin at either end is 5 % of the time.
+        half = max(0.55 * (last - first), 0.5 * _SHORTEST_AXIS_DAYS)
+        centre = 0.5 * (first + last)
+        panels[0].set_xlim(centre - half, centre + half)
+    return np.asarray(days, dtype=float)
 
 
 def plain_label(label: str) -> str:
