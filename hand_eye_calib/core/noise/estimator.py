@@ -1,10 +1,11 @@
 """Adaptive estimator of X by generalised least squares.
 
-The noise model is estimated together with X, so that the likelihood weights all increments. No
-distance between poses (reference) has to be chosen: white noise would need long distances, drift
-would need short ones. The model is in :mod:`hand_eye_calib.core.noise`, the stages of the search
-are in :mod:`~hand_eye_calib.core.noise.stages`. This module runs the stages and returns the
-solution with its noise in words. docs/adaptive.md has the derivation and tests.
+The noise model is estimated together with X, so the likelihood decides the weight of every
+increment. The user need not choose a distance between poses (reference): white noise would need
+long distances, drift would need short distances. The model is in :mod:`hand_eye_calib.core.noise`,
+the stages of the search are in :mod:`~hand_eye_calib.core.noise.stages`. This module runs the
+stages and returns the solution, with a description of its noise. docs/adaptive.md has the
+derivation and tests.
 """
 
 from __future__ import annotations
@@ -55,22 +56,22 @@ from hand_eye_calib.core.results.records import CorrelatedError, Noise
 # Stages that a quick solve skips.
 _SLOW_STAGES = frozenset({"tails", "time_correlated"})
 
-# Stages noise, outliers and tails. If the search does not settle, it is repeated from their fit
+# Stages noise, outliers and tails. If X does not settle, the search continues from their fit
 # without time-correlated errors.
 _FIRST_STAGES = STAGES[:3]
 _LAST_STAGES = STAGES[3:]
 
-# A systematic error is reported if it exceeds this number of standard deviations.
+# A systematic error is printed if it exceeds this number of standard deviations.
 MIN_REPORTED_SIGMAS = 3.0
 
-# Smallest jitter of stamps (ms) that is reported.
+# Smallest jitter of stamps (ms) that is printed.
 _MIN_REPORTED_JITTER_MS = 0.1
 
 _FIXED_TO = {"body": "the child's body", "world": "the parent's world"}
 
 
 class NoiseModelError(InputError):
-    """No noise model fits the poses, because a matrix is not positive definite to rounding."""
+    """No noise model fits the poses: a matrix is not positive definite up to rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +92,7 @@ class ModelSolution:
     time_offset_s, time_offset_sigma_s : float
         Seconds to be added to the child's stamps, and their standard deviation.
     jumps : (n,) bool array
-        Increments (from pose i to i + 1) across which a trajectory jumps and does not return.
+        Increments (from pose i to pose i + 1) at which a trajectory jumps and does not return.
     spikes : (n + 1,) bool array
         Outlier poses, which were not used.
     misfit : float
@@ -123,11 +124,11 @@ class ModelSolution:
 
     @property
     def left_out(self) -> BoolArray:
-        """Increments (n,) that are jumps, or that begin or end at an outlier pose."""
+        """Mask (n,) of unused increments: jumps, and increments beside an outlier pose."""
         return self.jumps | self.spikes[1:] | self.spikes[:-1]
 
     def events(self, stamps_ns: IntArray) -> list[str]:
-        """Return sentences about jumps and outliers, with the times (s) of the first five."""
+        """Return sentences about jumps and outliers, with the times (s) of up to five of them."""
         stamps_s = np.asarray(stamps_ns * 1e-9, dtype=np.float64)
         jumps_s = stamps_s[1:][self.jumps]
         outliers_s = stamps_s[self.spikes]
@@ -162,14 +163,14 @@ class AdaptiveSolution(ModelSolution):
         Covariance of xi = (rho, phi) in ``X exp(xi)``. It includes the uncertainty of systematic
         errors, and the misfit.
     unseen : (6, U) array
-        Unit vectors of xi along which no increment has information.
+        Unit vectors of xi about which no increment has information.
     weights : (n + 1,) array
-        Weights of the white errors of poses; other than 1 only if the errors have heavy tails.
+        Weights of the white errors of the poses; 1 unless the errors have heavy tails.
     metres_per_pose : float
         Length of the parent's path (m), divided by the number of poses.
     is_noise_dominated : bool
-        Whether the noise of single poses exceeds a share of the rotation between them
-        (``Tuning.noisy_share``), so that only every k-th pose was used.
+        Whether the noise of single poses exceeds a share of the rotation between poses
+        (``Tuning.noisy_share``). Then only every k-th pose was used.
     """
 
     T_parent_child: FloatArray
@@ -181,7 +182,7 @@ class AdaptiveSolution(ModelSolution):
 
     @property
     def systematic(self) -> str:
-        """Names of the significant systematic errors, joined by ``+``; ``none`` without any."""
+        """Names of the significant systematic errors, joined by ``+``, or ``none``."""
         is_significant = (
             np.abs(self.parameters)
             > MIN_REPORTED_SIGMAS * self.parameter_sigmas
@@ -195,16 +196,17 @@ class AdaptiveSolution(ModelSolution):
 
     @property
     def rate_bias(self) -> FloatArray:
-        """Bias of the child's angular rates minus that of the parent's.
+        """Difference of the biases of the angular rates: child minus parent.
 
-        The array is (2, 3) in rad/s along the child's axes: values, then standard deviations.
+        The array (2, 3) has the difference and its standard deviations as rows, in rad/s along the
+        child's axes.
         """
         return np.stack([self.parameters[RATE], self.parameter_sigmas[RATE]])
 
     def rotation_variance(self, n_intervals: IntArray | int) -> FloatArray:
-        """Return the error variance (rad^2) per axis of the measured rotation between two poses.
+        """Return the error variance (rad^2) per axis of the rotation between two measured poses.
 
-        The poses are ``n_intervals`` typical intervals of the model apart.
+        The poses are ``n_intervals`` typical intervals of the model apart from each other.
         """
         white, walk = np.exp(self.levels[[ROTATION, WALK_ROTATION]])
         variance = 2 * white + n_intervals * walk
@@ -216,7 +218,7 @@ class AdaptiveSolution(ModelSolution):
 
     @cached_property
     def noise(self) -> Noise:
-        """Noise in numbers: standard deviations per axis, and names of systematic errors."""
+        """Noise as numbers: standard deviations per axis, and names of systematic errors."""
         sigmas = fast_sigmas(self.levels)
         process_sigmas = np.exp(0.5 * self.levels[VARIANCES])
         taus_s = np.exp(self.levels[TIME_CONSTANTS])
@@ -247,15 +249,14 @@ class AdaptiveSolution(ModelSolution):
         offset_s: float | None = None,
         scale: float | None = None,
     ) -> Noise:
-        """Return the noise in numbers and in words, with the times of jumps and outliers.
+        """Return the noise as numbers and as sentences, with the times of jumps and outliers.
 
         Parameters
         ----------
         stamps_ns : (N,) int64 array
             Stamps of the poses.
         offset_s, scale : float, optional
-            Time offset and scale that were estimated before and applied to the poses. The solution
-            refines them.
+            Time offset and scale that were applied to the poses before. The solution refines them.
         """
         sentences = self._noise_in_words() + self._systematic_in_words(
             offset_s, scale
@@ -279,7 +280,7 @@ class AdaptiveSolution(ModelSolution):
                 "ten times that after 100 m"
             )
         else:
-            # Streams of rotations have no translations.
+            # Streams of rotations have no translation errors.
             processes = tuple(
                 process for process in processes if process.part == "rotation"
             )
@@ -296,7 +297,7 @@ class AdaptiveSolution(ModelSolution):
     def _systematic_in_words(
         self, offset_s: float | None, scale: float | None
     ) -> list[str]:
-        """Return sentences about the significant systematic errors; see :meth:`describe`."""
+        """Return sentences about the significant systematic errors, see :meth:`describe`."""
         systematic = self.systematic.split("+")
         sentences = []
         if "scale" in systematic and scale is not None:
@@ -308,7 +309,7 @@ class AdaptiveSolution(ModelSolution):
             percent = 100 * (self.scale - 1)
             sigma = 100 * self.scale_sigma
             size = f"{abs(percent):.2f} +/- {sigma:.2g} %"
-            # A scale above 1 makes the child's lengths longer: as measured, they are too short.
+            # If the scale exceeds 1, the measured lengths of the child are too short.
             comparison = "shorter" if percent > 0 else "longer"
             sentences.append(
                 f"the child's lengths are {size} {comparison} than the parent's"
@@ -388,9 +389,9 @@ def solve(
         that the covariance of X contains its uncertainty.
     without : collection of str
         Names of :data:`~hand_eye_calib.core.noise.stages.STAGES` that are skipped. With "centre",
-        rotation errors turn about the sensors.
+        the centre of rotation errors is not searched for: they turn about the sensors.
     tuning : Tuning
-        Numbers of the search.
+        Constants of the search.
 
     Returns
     -------
@@ -399,7 +400,7 @@ def solve(
     Raises
     ------
     NoiseModelError
-        If no noise model fits the poses, because a matrix is not positive definite to rounding.
+        If no noise model fits the poses: a matrix is not positive definite up to rounding.
     """
     problem = Problem(
         streams=Streams((stamps_ns - stamps_ns[0]) * 1e-9, Ts_pw_p, Ts_cw_c),
@@ -421,8 +422,8 @@ def _search(problem: Problem) -> AdaptiveSolution:
     """Run all stages, and return the solution.
 
     The rotation noise of a camera that observes a target may be as large as the rotation between
-    two poses. Then the search is repeated with every k-th pose. If X does not settle, the last
-    stages are repeated without time-correlated errors.
+    two poses. The search is then repeated with every k-th pose. If X does not settle, the search
+    continues from the fit of the first stages without time-correlated errors.
     """
     workspace = Workspace(problem)
     first = _run_stages(_FIRST_STAGES, workspace, start(problem))
@@ -443,7 +444,7 @@ def _search(problem: Problem) -> AdaptiveSolution:
 
 
 def _run_stages(stages: Sequence[Stage], workspace: Workspace, fit: Fit) -> Fit:
-    """Return the fit after these stages, except those that the problem skips."""
+    """Return the fit after the given stages, without the stages that the problem skips."""
     for stage in stages:
         if stage.__name__ not in workspace.problem.without:
             fit = stage(workspace, fit)
@@ -451,14 +452,14 @@ def _run_stages(stages: Sequence[Stage], workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _strided_poses(problem: Problem, fit: Fit) -> IntArray:
-    """Return the indices of every k-th pose that is no outlier.
+    """Return the indices of every k-th pose, among the poses that are no outliers.
 
     The stride k is the shortest one in ``tuning.strides`` for which the rotation over k poses
-    clearly exceeds the rotation noise. It is at most the longest stride that keeps enough poses.
+    clearly exceeds the rotation noise, but at most the longest stride that leaves enough poses.
     """
     tuning = problem.tuning
     sound_poses = np.flatnonzero(~fit.outliers.spikes)
-    # A solution needs about 50 poses.
+    # About 50 poses must remain for a solution.
     possible_strides = [
         stride for stride in tuning.strides if len(sound_poses) >= stride * 50
     ]
@@ -475,14 +476,14 @@ def _strided_poses(problem: Problem, fit: Fit) -> IntArray:
 def _expand_to_all_poses(
     fewer: AdaptiveSolution, kept: IntArray, spikes: BoolArray
 ) -> AdaptiveSolution:
-    """Expand the arrays of a solution for the subset ``kept`` (indices) to all poses.
+    """Expand the arrays of a solution from the subset ``kept`` (indices) to all poses.
 
-    ``spikes`` (N,) are the outliers that were detected in all poses.
+    ``spikes`` (N,) are the outliers among all poses.
     """
     jumps = np.zeros(len(spikes) - 1, dtype=bool)
     spikes = spikes.copy()
     weights = np.ones(len(spikes))
-    # A jump between two kept poses is marked at the last increment before the second one.
+    # A jump between two kept poses is stored at the last increment before the second pose.
     jumps[kept[1:][fewer.jumps] - 1] = True
     spikes[kept[fewer.spikes]] = True
     weights[kept] = fewer.weights
@@ -503,17 +504,17 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
     normal = posterior.normal
     final = fit.moved(normal.step, columns)
     misfit = float(normal.cost) / _degrees_of_freedom(problem, fit)
-    # A misfit below 1 does not reduce the covariance: short distances between poses dominate the
-    # misfit, long distances dominate X.
+    # A misfit below 1 does not reduce the covariance: the misfit depends on short distances between
+    # poses, X on long distances.
     covariance = max(misfit, 1.0) * normal.covariance
     sigmas = np.zeros(N_SYSTEMATIC)
     sigmas[columns] = np.sqrt(np.diag(covariance)[6:])
     is_present = fit.sigmas > problem.tuning.absent_sigma
     parameters = np.where(is_present, final.parameters, 0.0)
     sigmas = np.where(is_present, sigmas, 0.0)
-    # Translation errors fixed to the body that are constant for about as long as the recording are
-    # not detected, and X contains their mean. Their variance is assumed to be a share of the
-    # variance of the detected ones.
+    # A translation error fixed to the body is not detected if it is constant for about as long as
+    # the recording; X then contains its mean. Its variance is assumed to be a share of the variance
+    # of the detected errors.
     undetected = np.zeros(6)
     for (kind, _), level in zip(
         fit.model.processes, fit.levels[VARIANCES], strict=True
@@ -546,7 +547,7 @@ def _solution(workspace: Workspace, fit: Fit) -> AdaptiveSolution:
 
 
 def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
-    """Return the number of residuals that are used, less that of parameters; at least 1."""
+    """Return the number of used residuals minus the number of parameters; at least 1."""
     streams = problem.streams
     positions = np.concatenate(
         [
@@ -555,7 +556,7 @@ def _degrees_of_freedom(problem: Problem, fit: Fit) -> int:
         ],
         axis=1,
     )
-    # Streams of rotations alone have constant positions.
+    # Rotations without positions have three residuals instead of six.
     n_rows = 6 if np.ptp(positions, axis=0).any() else 3
     n_used = int((~fit.outliers.jumps).sum()) - int(fit.outliers.spikes.sum())
     return max(n_rows * n_used - 6 - len(problem.columns), 1)

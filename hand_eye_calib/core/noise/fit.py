@@ -36,7 +36,8 @@ from hand_eye_calib.core.noise.partwise import MAX_POSES, PartwisePosterior
 from hand_eye_calib.core.noise.state_space import WHITE, Posterior, StateSpace
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 
-# Longest accepted step of the translation of X (m). No lever arm is that long.
+# A step of the translation of X that is longer than this (m) is not applied: no lever arm is so
+# long.
 _MAX_STEP_M = 1000.0
 
 
@@ -51,10 +52,10 @@ class Problem:
         Indices of the systematic errors in the model, see
         :data:`~hand_eye_calib.core.noise.increments.PARAMETERS`.
     is_clock_free : bool
-        Whether the time offset was estimated from the same poses. It is then always a parameter, so
-        that the covariance of X contains its uncertainty.
+        Whether the time offset was estimated from the same poses. The offset is then always a
+        parameter, so that the covariance of X contains its uncertainty.
     without : frozenset of str
-        Names of the stages that are skipped. With "centre", rotation errors turn about the sensors.
+        Names of the skipped stages. With "centre", rotation errors turn about the sensors.
     tuning : Tuning
     """
 
@@ -65,12 +66,12 @@ class Problem:
     tuning: Tuning = TUNING
 
     def prior(self, fit: Fit) -> FloatArray:
-        """Return the prior of the parameters as products (p + 1, p + 1)."""
+        """Prior of the parameters, as products (p + 1, p + 1)."""
         values = fit.parameters[self.columns]
         return prior_products(values, fit.sigmas[self.columns], 7 + len(values))
 
     def linearised(self, fit: Fit) -> Linearisation:
-        """Return the residuals at a fit and their derivatives."""
+        """Return the residuals and their derivatives at a fit."""
         return linearise(
             fit.poses,
             fit.course,
@@ -81,13 +82,13 @@ class Problem:
         )
 
     def space(self, fit: Fit, kept: IntArray | None = None) -> StateSpace:
-        """Return the state space at a fit, of all poses or of the subset ``kept`` (indices)."""
+        """Return the state space at a fit, for all poses or for the subset ``kept`` (indices)."""
         if kept is not None:
             fit = fit.at_poses(kept, self.tuning.burst[-1])
         return self.space_of(fit, self.linearised(fit))
 
     def space_of(self, fit: Fit, linearisation: Linearisation) -> StateSpace:
-        """Return the state space of all poses at a fit, given its linearisation."""
+        """Return the state space of all poses at a fit whose linearisation is known."""
         return fit.model.state_space(
             fit.poses,
             linearisation,
@@ -99,14 +100,14 @@ class Problem:
         )
 
     def course(self, T_parent_child: FloatArray, levels: FloatArray) -> Course:
-        """Return the motion of the child, smoothed as much as the noise levels (m,) require."""
+        """Return the motion of the child, smoothed according to the noise levels (m,)."""
         noise_m = float(np.exp(0.5 * increment_levels(levels)[0]))
         return course_of(
             self.streams, T_parent_child, self.tuning.caution * noise_m**2
         )
 
     def is_noisy(self, fit: Fit) -> bool:
-        """Return whether rotation noise exceeds a share of the usual rotation between poses."""
+        """Return whether the rotation noise exceeds a share of the usual rotation between poses."""
         turns = se3.rotation_angle(se3.rotation_of(self.streams.motions_p))
         return bool(
             np.exp(0.5 * fit.levels[ROTATION])
@@ -124,15 +125,16 @@ class Workspace:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        # Only one posterior is stored, because the posterior of a long recording is large.
+        # Only one posterior is stored: for a long recording it is large.
         self._fit: Fit | None = None
         self._posterior: Posterior | PartwisePosterior | None = None
         self._linearisation: Linearisation | None = None
 
     def posterior(self, fit: Fit) -> Posterior | PartwisePosterior:
-        """Return the posterior of all poses at a fit; the same fit again costs nothing."""
+        """Return the posterior of all poses at a fit; a second call for it costs nothing."""
         if self._posterior is None or self._fit is not fit:
-            # Release the memory of the stored posterior before the next one is computed.
+            # Release the stored posterior before the next one is computed: two would fill the
+            # memory.
             self._posterior = None
             if self._fit is None or not fit.is_linearised_as(self._fit):
                 self._linearisation = None
@@ -178,7 +180,7 @@ class Fit:
         Levels of the model: log variances and log time constants.
     outliers : Outliers
     weights : (N,) array
-        Weights of white errors; other than 1 only if white errors have heavy tails.
+        Weights of the white errors; 1 unless white errors have heavy tails.
     sigmas : (8,) array
         Prior standard deviations of systematic errors.
     has_heavy_tails : bool
@@ -203,9 +205,9 @@ class Fit:
     )
 
     def is_linearised_as(self, other: Fit) -> bool:
-        """Return whether the residuals and derivatives are those of another fit.
+        """Return whether this fit and another fit have the same residuals and derivatives.
 
-        Fits that differ in levels or weights share these arrays.
+        They have, if only levels or weights differ.
         """
         names = ("poses", "error", "course", "T", "parameters")
         return all(
@@ -213,7 +215,7 @@ class Fit:
         )
 
     def at_poses(self, kept: IntArray, longest_gap: int) -> Fit:
-        """Return the fit for a subset of poses (indices), see :meth:`Outliers.across`."""
+        """Return the fit of a subset of the poses (indices), see :meth:`Outliers.across`."""
         return replace(
             self,
             poses=self.poses[kept],
@@ -226,8 +228,8 @@ class Fit:
     def moved(self, step: FloatArray, columns: list[int]) -> Fit:
         """Return the fit after a step of the parameters beta.
 
-        ``step`` (6 + k,) contains xi, then changes of the k systematic errors in ``columns``. X
-        does not change if its step is longer than any lever arm: then the step is noise along a
+        ``step`` (6 + k,) contains xi, then the changes of the k systematic errors in ``columns``. X
+        stays unchanged if its step is longer than any lever arm: such a step is noise along a
         direction that the motion hardly excites.
         """
         parameters = self.parameters.copy()
@@ -239,12 +241,12 @@ class Fit:
         )
 
     def corrected(self, streams: Streams, states: FloatArray) -> Fit:
-        """Return the fit with poses from which the smoothed errors c are removed.
+        """Return the fit with poses from which the smoothed errors c were removed.
 
         White errors are split between both sensors in proportion to their covariances. All other
-        errors, and errors of outlier poses, are split in halves. The covariances of white noise do
-        not apply to them: an error of centimetres, split by covariances of millimetres, would
-        become large and opposite rotations of both sensors.
+        errors, and the errors of outlier poses, are split into halves, because the covariances of
+        white noise do not apply to them. An error of centimetres, split by covariances of
+        millimetres, would become large and opposite rotations of both sensors.
 
         Parameters
         ----------
@@ -266,7 +268,7 @@ class Fit:
         of_parent = white_of_parent + 0.5 * other_error
         of_child = white_of_parent - white_error - 0.5 * other_error
         measured = bridge_outliers(streams, T, spikes)
-        # The adjoint converts the error of the parent to the parent's frame.
+        # The adjoint converts the parent's error from the child's frame to the parent's frame.
         poses = Streams(
             streams.stamps_s,
             measured.Ts_pw_p @ se3.exp(-of_parent @ se3.adjoint(T).T),

@@ -9,16 +9,15 @@ pose i + 1, w_i is the error of the motions themselves, and X is the present est
     e_i = Log(B_i^-1 X^-1 A_i X)
     e_i + (I - Ad(B_i^-1)) xi = c_{i+1} - Ad(B_i^-1) c_i + w_i
 
-The factor of xi is the derivative of e_i. Systematic errors have derivatives, too: a scale, a bias
-per metre of path, a time offset, a bias of angular rates.
+The derivative of e_i with respect to xi is the factor of xi. The derivatives with respect to the
+systematic errors follow: a scale, a bias per metre of path, a time offset, a bias of angular rates.
 
-Derivatives are computed at poses from which the errors estimated so far were removed. The residuals
-are those of the measured poses: these errors are added back. Derivatives at noisy poses are noisy,
-too, and would bias X if the noise is not much smaller than the motion from pose to pose (errors in
-variables).
+Derivatives are computed at poses from which the estimated errors were removed. Derivatives at noisy
+poses would bias X if the noise is not much smaller than the motion from pose to pose (errors in
+variables). The residuals are those of the measured poses, so these errors are added back.
 
-For the same reason, the derivatives with respect to scale and bias use smoothed steps of the child,
-which contain at most a share of the noise of the increment's own residual. Otherwise the scale
+For the same reason, the derivatives with respect to scale and bias use smoothed steps of the child.
+A smoothed step contains only a small part of the noise of its own residual. Otherwise the scale
 would be underestimated if steps are smaller than their noise.
 """
 
@@ -47,19 +46,18 @@ PARAMETERS = {"scale": [0], "bias": [1, 2, 3], "time": [4], "rate": [5, 6, 7]}
 (SCALE,), BIAS, (TIME,), RATE = PARAMETERS.values()
 N_SYSTEMATIC = sum(map(len, PARAMETERS.values()))
 
-# Systematic errors in the model for poses, for rotations, and for rotations that are integrated
-# angular rates.
+# Systematic errors in the model: for poses, for rotations, and for integrated angular rates.
 SYSTEMATIC = ("scale", "bias", "time")
 SYSTEMATIC_OF_ROTATIONS = ("time",)
 SYSTEMATIC_OF_RATES = ("time", "rate")
 
-# Parts of a step of the child that may drift: its length (scale) and its direction.
+# Parts of the child's step that may drift: its length (scale) and its direction.
 PATH_PARTS = ("scale", "direction")
 
-# Number of increments whose first residuals are computed at once. It limits the memory.
+# Largest number of increments whose first residuals are computed at once. It limits the memory.
 _BATCH = 10_000
 
-# Lower bound of the variance (m^2) between steps and their neighbours. Smaller ones are rounding.
+# Lower bound of the variance (m^2) of a step about its neighbours. A smaller variance is rounding.
 _ROUNDING_M2 = 1e-18
 
 
@@ -101,13 +99,13 @@ class Streams(Columns):
     def twists(self) -> FloatArray:
         """Velocity (N, 6), m/s and rad/s, of the child in its own frame.
 
-        Each component is the median of the four motions nearest to the pose, so that a jump does
-        not count as velocity.
+        Each component is the median over the four motions nearest to the pose. So a jump does not
+        count as velocity.
         """
         rates = se3.log(self.motions_c) / np.diff(self.stamps_s)[:, None]
         padded = np.pad(rates, ((2, 2), (0, 0)), mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 4, axis=0)
-        # The median of four numbers. np.median would import numpy.ma for 7 ms.
+        # Median of four numbers. np.median would import numpy.ma, which takes 7 ms.
         return np.sort(windows, axis=2)[:, :, 1:3].mean(axis=2)
 
 
@@ -115,8 +113,8 @@ class Streams(Columns):
 class Course(Columns):
     """Smoothed motion of the child, for derivatives with respect to systematic errors.
 
-    The path and the products are sums over time, so that differences between any two poses are
-    those of the increment between them.
+    The path and the products are sums over time: their difference between two poses belongs to the
+    increment between these poses.
 
     Attributes
     ----------
@@ -125,8 +123,8 @@ class Course(Columns):
     path : (N, 3) array
         Smoothed position (m) of the child in its world, relative to the first pose.
     along : (N, 3, 3) array
-        Sum over all steps so far of the length of the step (m) times the child's orientation. Its
-        product with a bias per metre is the error of the position.
+        Sum, over all steps before the pose, of the length of the step (m) times the orientation of
+        the child. A bias per metre times this sum is the error of the position.
     """
 
     twists: FloatArray
@@ -139,8 +137,8 @@ def course_of(
 ) -> Course:
     """Smooth the motion of the child.
 
-    The smoothed steps are the mean of the child's steps according to both streams. The lengths of
-    steps come from the parent's stream, which has no bias per metre.
+    A smoothed step is the mean of the child's steps from both streams. Its length comes from the
+    parent's stream, which has no bias per metre.
 
     Parameters
     ----------
@@ -148,14 +146,14 @@ def course_of(
     T_parent_child : (4, 4) array
         X.
     noise_m2 : float
-        Noise variance of a step per axis. The differences between steps and their neighbours are
-        removed if their median square is at most this variance, and hardly changed if it is far
-        larger. ``inf`` removes them.
+        Noise variance of a step per axis. If the median square of the differences between steps and
+        their neighbours is at most this variance, the differences are removed. They hardly change
+        if it is far larger. ``inf`` removes them.
     """
     R = se3.rotation_of(T_parent_child)
     lever_arm = se3.translation_of(T_parent_child)
     steps_by_child = se3.translation_of(streams.motions_c)
-    # Translation of A X relative to X, in the child's axes.
+    # Translation of A_i X relative to X, in the child's axes.
     rotated = se3.rotation_of(streams.motions_p) @ lever_arm - lever_arm
     steps_by_parent = (rotated + se3.translation_of(streams.motions_p)) @ R
     intervals_s = np.diff(streams.stamps_s)
@@ -176,9 +174,9 @@ def course_of(
 def _smooth_steps(
     steps: FloatArray, intervals_s: FloatArray, noise_m2: float
 ) -> FloatArray:
-    """Move each step i of (n, 3) towards the mean velocity of steps i - 2 and i + 2.
+    """Move each step i (n, 3) towards the mean velocity of the steps i - 2 and i + 2.
 
-    The difference from this mean is multiplied by the share of its median square that is not noise.
+    Its difference from this mean is multiplied by the part of the median square that is not noise.
     """
     velocities = steps / intervals_s[:, None]
     padded = np.pad(velocities, ((2, 2), (0, 0)), mode="edge")
@@ -190,7 +188,7 @@ def _smooth_steps(
 
 
 def cumulative_sum(steps: FloatArray) -> FloatArray:
-    """Return the sums (N, ...) of the steps (N - 1, ...) before each instant; the first is zero."""
+    """Return the sums (N, ...) of the steps (N - 1, ...) before each instant, from zero."""
     return np.concatenate(
         [np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)]
     )
@@ -198,7 +196,7 @@ def cumulative_sum(steps: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Linearisation:
-    """Residuals e and their derivatives at one X.
+    """Residuals e and their derivatives at a given X.
 
     Attributes
     ----------
@@ -208,9 +206,9 @@ class Linearisation:
     adjoints : (n, 6, 6) array
         Ad(B_i^-1).
     by_path : dict of str to array
-        Derivatives of e with respect to drifting errors of the path: "scale" (n, 6, 1), and
-        "direction" (n, 6, 3), for steps that are rotated by minus this vector (rad) in the child's
-        frame.
+        Derivatives of e with respect to drifting errors of the path: "scale" (n, 6, 1) and
+        "direction" (n, 6, 3). A direction error is a rotation vector (rad) in the child's frame;
+        the step is rotated by its negative.
     """
 
     columns: FloatArray
@@ -241,14 +239,14 @@ def linearise(
     T_parent_child : (4, 4) array
         X.
     parameters : (8,) array
-        Present values of all systematic errors, see :data:`PARAMETERS`.
+        Current values of all systematic errors, see :data:`PARAMETERS`.
     columns : list of int
-        Indices of the systematic errors whose derivatives are returned.
+        Indices of the systematic errors with derivatives in the result.
     error : (N, 6) array, optional
         Errors c that were removed from the poses; they are added to the residuals.
     """
     R_c_transposed = transposed(streams.Ts_cw_c[:-1, :3, :3])
-    # Smoothed steps in the child's frame, and the factors of a bias per metre.
+    # Smoothed steps in the child's frame, and the derivatives with respect to a bias per metre.
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
     B, by_rate = _child_motions(streams, course, parameters)
@@ -298,7 +296,7 @@ def first_residuals(
 def _child_motions(
     streams: Streams, course: Course, parameters: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute motions of the child, corrected for its time offset and bias of rates.
+    """Compute motions of the child, corrected for its time offset and its bias of angular rates.
 
     Returns
     -------
@@ -325,8 +323,9 @@ def _derivatives_by_rate_bias(
 ) -> FloatArray:
     """Return derivatives (n, 3, 3), in s, of rotations (n, 3, 3) with respect to a bias of rates.
 
-    A constant bias (rad/s) along the body's axes turns the end of an interval by about its duration
-    times the mean of the axes at start and end, expressed in the frame of the end.
+    The axes of the body turn during an interval. To first order, a constant bias (rad/s) along them
+    rotates the end of the interval by its duration times the mean of the axes at start and end, in
+    the frame of the end.
     """
     mean_axes: FloatArray = 0.5 * (np.eye(3) + transposed(rotations))
     return intervals_s[:, None, None] * mean_axes
@@ -335,12 +334,12 @@ def _derivatives_by_rate_bias(
 def without_rate_bias(
     stamps_ns: IntArray, Ts_cw_c: FloatArray, bias: FloatArray
 ) -> FloatArray:
-    """Remove a bias (3,), rad/s, of angular rates from the rotations integrated from them.
+    """Remove a bias (3,), rad/s, of angular rates from rotations integrated from the rates.
 
     Returns
     -------
     (N, 4, 4) array
-        Poses with corrected rotations, relative to the first one, and zero translations.
+        Poses with corrected rotations relative to the first pose, and zero translations.
     """
     child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
     rotations = se3.rotation_of(child_motions)

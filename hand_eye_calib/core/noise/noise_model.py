@@ -11,9 +11,9 @@ errors:
   ``M = Ad(X^-1) blkdiag(R_p', R_p')`` with the orientation R_p of the parent;
 - Gauss-Markov processes of increments: a drifting scale, or a drifting direction of travel.
 
-Each error has one variance for all axes. Rotations of white noise and of the walk also shift the
-child, by its lever arm. Jitter acts along the velocity alone. A level is the logarithm of a
-variance or of a time constant. Derivation: docs/adaptive.md.
+Each error has one variance for all axes. White rotation errors and rotations of the walk also
+displace the child, by its lever arm. Jitter displaces it along the velocity only. A level is the
+logarithm of a variance or of a time constant. Derivation: docs/adaptive.md.
 """
 
 from __future__ import annotations
@@ -36,49 +36,50 @@ from hand_eye_calib.core.noise.reml import Prior
 from hand_eye_calib.core.noise.state_space import WHITE, StateSpace
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# Points that white rotation errors turn about: the sensors themselves, or the origin of the child's
-# or of the parent's world. Errors of a camera that observes a target turn about the target, which
-# is the origin of its world.
+# Centres of white rotation errors: the sensors themselves, or the origin of the child's or of the
+# parent's world. A camera that observes a target has errors about the target, which is the origin
+# of its world.
 CENTRES = ("sensors", "child", "parent")
 
-# Indices of the levels of fast errors, which are not time-correlated: white errors and the walk.
-# The variances are those of white translation (m^2), white rotation (rad^2), jitter of stamps
-# (s^2), and of the walk of translation (m^2) and of rotation (rad^2) over a typical increment.
+# Indices of the levels of fast errors (white errors and the walk), which are not time-correlated.
+# Variances in order: white translation (m^2), white rotation (rad^2), jitter of stamps (s^2), and
+# the walk of translation (m^2) and of rotation (rad^2) over a typical increment.
 N_FAST = 5
 TRANSLATION, ROTATION, JITTER, WALK_TRANSLATION, WALK_ROTATION = range(N_FAST)
 WHITES = slice(TRANSLATION, ROTATION + 1)
 WALKS = slice(WALK_TRANSLATION, WALK_ROTATION + 1)
-# Levels of time-correlated errors follow: of each process the variance, then the time constant (s).
+# The levels of time-correlated errors are behind: for each process its variance, then its time
+# constant (s).
 VARIANCES = slice(N_FAST, None, 2)
 TIME_CONSTANTS = slice(N_FAST + 1, None, 2)
 
-# Rows of both parts of a vector of six.
+# Rows of the translation and of the rotation in a vector of six.
 PARTS = {"translation": slice(0, 3), "rotation": slice(3, 6)}
-# Covariance bases of translations and of rotations of equal variance on all axes.
+# Covariance bases with equal variance on all axes: of translations and of rotations.
 TRANSLATIONS = np.diag([1.0, 1.0, 1.0, 0, 0, 0])
 ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
-# Lower bound of all variances (m^2, rad^2, s^2). Smaller variances are rounding.
+# Lower bound of all variances (m^2, rad^2, s^2). A smaller variance is rounding.
 MIN_VARIANCE = 1e-14
-# Upper bound of all log variances.
+# Upper bound of the logarithms of all variances.
 _MAX_LEVEL = 14.0
 
-# Lower bound of the log variances of white noise and of the walk, relative to the log variance of
-# an increment. Smaller variances are lost to rounding, because one matrix contains the precisions
-# of white noise and walk.
+# Lower bound of the log variances of white noise and walk, relative to the log variance of an
+# increment. One matrix contains the precisions of white noise and walk, so smaller variances are
+# lost to rounding.
 _MIN_LOG_SHARE = -12.0
 
-# Longest time constant of a drifting direction of travel, in intervals between poses. A direction
-# that is constant for longer is a bias or a rotated mount, which have parameters.
+# Longest time constant of a drifting direction of travel, in intervals between poses. A more
+# constant direction is a bias or a rotated mount, which are parameters.
 _MAX_INTERVALS_OF_DIRECTION = 10.0
 
-# Bounds of the variance of the walk over an increment, relative to a typical increment, so that
-# neither a gap nor two almost equal stamps dominate.
+# Bounds of the variance of the walk over an increment, divided by that over a typical increment.
+# They keep gaps and nearly equal stamps from dominating.
 _WALK_FACTOR_LIMITS = (0.1, 100.0)
 
 
 class FastSigmas(NamedTuple):
-    """Standard deviations per axis of white noise, jitter of stamps, and walk per increment."""
+    """Standard deviations per axis: white noise, jitter of stamps, walk per typical increment."""
 
     translation_m: float
     rotation_rad: float
@@ -87,14 +88,14 @@ class FastSigmas(NamedTuple):
     walk_rotation_rad: float
 
 
-#: Kind and part of a time-correlated error. Kind "body" is fixed to the child's body, "world" to
-#: the parent's world; the part is then "translation" or "rotation". Kind "path" is an error of the
-#: child's path, with the part "scale" or "direction".
+#: Kind and part of a time-correlated error. The kind "body" is fixed to the child's body and
+#: "world" to the parent's world; their parts are "translation" and "rotation". The kind "path" is
+#: an error of the child's path; its parts are "scale" and "direction".
 Process: TypeAlias = tuple[str, str]
 
-# All time-correlated errors that the search tries. A rotation fixed to the body is missing: it
-# would be a mount that wanders, so that old data would not count for X. No recording has gained by
-# it.
+# All time-correlated errors that the search tries. A rotation fixed to the body is left out: it
+# would be a wandering mount, and old data would not count for X. No recording became more accurate
+# by it.
 PROCESSES: tuple[Process, ...] = (
     ("body", "translation"),
     ("world", "translation"),
@@ -113,7 +114,7 @@ class NoiseModel:
     processes : tuple of Process
         Time-correlated errors.
     centre : {"sensors", "child", "parent"}
-        Point that white rotation errors turn about, see :data:`CENTRES`.
+        Centre of white rotation errors, see :data:`CENTRES`.
     interval_s, duration_s : float
         Typical interval between poses, and duration of the recording.
     tuning : Tuning
@@ -136,7 +137,7 @@ class NoiseModel:
         cut: BoolArray,
         prior: FloatArray,
     ) -> StateSpace:
-        """Return the state space of a linearisation.
+        """Return the state space for a linearisation.
 
         Parameters
         ----------
@@ -154,8 +155,8 @@ class NoiseModel:
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         intervals_s = np.diff(streams.stamps_s)
-        # Half of the rotation noise R is that of the parent. Through the lever arm, it also
-        # displaces the child: 1/2 (R + Ad(X^-1) R Ad(X^-1)').
+        # The parent has half of the rotation noise R. Its half also displaces the child, through
+        # the lever arm: 1/2 (R + Ad(X^-1) R Ad(X^-1)').
         rotations = 0.5 * (ROTATIONS + to_child @ ROTATIONS @ to_child.T)
         white_rotations = rotations[None]
         if self.centre != "sensors":
@@ -197,8 +198,8 @@ class NoiseModel:
     ) -> FloatArray:
         """Return the covariances (N, 6, 6) of c for rotation errors about the origin of a world.
 
-        The errors have a standard deviation of 1 rad per axis. The world is that of ``centre``,
-        which is "child" or "parent".
+        The standard deviation of the errors is 1 rad per axis. ``centre`` ("child" or "parent")
+        selects the world.
         """
         poses = streams.Ts_cw_c if self.centre == "child" else streams.Ts_pw_p
         by_rotation = np.zeros((len(poses), 6, 3))
@@ -211,15 +212,15 @@ class NoiseModel:
     def shares(
         self, levels: FloatArray, streams: Streams, T_parent_child: FloatArray
     ) -> FloatArray:
-        """Return the matrices (1 or N, 6, 6) from white errors v to the parent's part of v.
+        """Return the matrices (1 or N, 6, 6) from the white errors v to the parent's share of v.
 
         S_p and S_c are the white covariances of parent and child without jitter, in the child's
         frame. The expected white errors a of the parent and b of the child are
 
             Ad(X^-1) a = S_p (S_p + S_c)^-1 v,      b = -S_c (S_p + S_c)^-1 v
 
-        Each sensor has half of the noise. Exception: rotation noise about the origin of a world is
-        that of the sensor in this world.
+        Each sensor has half of the noise, with one exception: rotation noise about the origin of a
+        world belongs to the sensor in this world.
         """
         to_child = se3.adjoint(se3.inverse(T_parent_child))
         translation, rotation = np.exp(levels[WHITES])
@@ -249,7 +250,8 @@ class NoiseModel:
         lower[WHITES] = np.maximum(lower[WHITES], total + _MIN_LOG_SHARE)
         lower[WALKS] = np.maximum(lower[WALKS], total + _MIN_LOG_SHARE)
         mean[JITTER] = tuning.jitter
-        # A prior standard deviation of 4.5 of the log variance: a factor of 10 of the jitter.
+        # The prior standard deviation of the log variance is 4.5: the jitter may differ by a factor
+        # of 10.
         precision[JITTER] = 0.05
         mean[TIME_CONSTANTS] = self._usual_log_tau
         precision[TIME_CONSTANTS] = tuning.tau_precision
@@ -263,10 +265,10 @@ class NoiseModel:
 
     @property
     def _usual_log_tau(self) -> float:
-        """Logarithm of the time constant (s) at the start of a search; also its prior mean.
+        """Logarithm of the time constant (s) at the start of a search; also the mean of its prior.
 
-        The search clips the start to the bounds of the time constants. The prior mean may be
-        outside the bounds for a short recording.
+        The search clips the start to the bounds of the time constants. For a short recording, the
+        mean of the prior may be outside these bounds.
         """
         shortest_s = self.tuning.start_tau_intervals * self.interval_s
         longest_s = max(
@@ -279,7 +281,7 @@ class NoiseModel:
         """Bounds of the logarithms of time constants (s).
 
         The lower bound is a typical interval between poses. The upper bound is a quarter of the
-        recording, because an error of longer duration is hardly different from a constant.
+        recording: an error that lasts longer is hardly different from a constant error.
         """
         longest_s = max(0.25 * self.duration_s, self.interval_s)
         return float(np.log(self.interval_s)), float(np.log(longest_s))
@@ -293,7 +295,7 @@ class NoiseModel:
         -------
         NoiseModel
         (m,) array
-            Levels for the start of a search: the given levels, then those of the processes.
+            Levels at the start of a search: the given levels, then the levels of the processes.
         """
         tuning = self.tuning
         of_poses = increment_levels(levels) + np.log(tuning.start_share)
@@ -310,7 +312,7 @@ class NoiseModel:
     ) -> FloatArray:
         """Return the time-correlated part ``sum_k M_k g_k`` (N, 6) of the error c.
 
-        Processes of the path are skipped: they are errors of increments, not of poses.
+        Processes of the path are left out: they are errors of increments, not of poses.
 
         Parameters
         ----------
@@ -333,7 +335,7 @@ class NoiseModel:
 def _directions(
     kind: str, part: str, streams: Streams, to_child: FloatArray
 ) -> FloatArray:
-    """Return the matrices M (N, 6, 3) from a process of kind "body" or "world" to the error c."""
+    """Return the matrices M (N, 6, 3) from a process of kind "body" or "world" to c."""
     if kind == "body":
         return np.broadcast_to(np.eye(6)[:, PARTS[part]], (len(streams), 6, 3))
     return to_child[:, PARTS[part]] @ transposed(
@@ -347,9 +349,10 @@ def fast_sigmas(levels: FloatArray) -> FastSigmas:
 
 
 def increment_levels(levels: FloatArray) -> FloatArray:
-    """Return the log variances (2,) of an increment: translation (m^2) and rotation (rad^2).
+    """Return the log variances (2,) of an increment: translation (m^2), rotation (rad^2).
 
-    The variance of an increment is that of the walk plus twice the white variance of a pose.
+    The variance of an increment is the variance of the walk plus twice the white variance of a
+    pose.
     """
     return np.logaddexp(levels[WALKS], levels[WHITES] + np.log(2.0))
 
@@ -357,13 +360,13 @@ def increment_levels(levels: FloatArray) -> FloatArray:
 def rough_levels(
     residuals: FloatArray, left_out: BoolArray, jitter: float
 ) -> FloatArray:
-    """Return levels (5,) for the start of a search: half of the variance is white, half is walk.
+    """Return levels (5,) at the start of a search: half of the variance is white, half is walk.
 
     Parameters
     ----------
     residuals : (n, 6) array
     left_out : (n,) bool array
-        Increments that are not used.
+        Increments that are ignored.
     jitter : float
         Log variance (s^2) of the jitter of stamps.
     """
@@ -373,7 +376,7 @@ def rough_levels(
         variances = squares.mean(axis=(0, 2))
     total = np.log(np.maximum(variances, 100 * MIN_VARIANCE))
     levels = np.full(N_FAST, jitter)
-    # An increment has the white noise of two poses.
+    # The white noise of an increment is that of its two poses.
     levels[WHITES] = total + np.log(0.25)
     levels[WALKS] = total + np.log(0.5)
     return levels

@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Cyclic reduction ends if at most this number of rows remains; they become one dense matrix. At
-# least this number of triangular matrices is inverted at once, in a quarter of the time of LAPACK.
+# Cyclic reduction ends if at most this number of rows remains; they form one dense matrix. From
+# this number of triangular matrices on, one joint inversion takes a quarter of the time of LAPACK.
 _FEW = 64
 
-# Number of triangular matrices that are inverted at once, so that they fit into the cache.
+# Number of triangular matrices that are inverted together. They fit into the cache.
 _CACHED = 500
 
-# Smallest eigenvalue of normal equations with ones on the diagonal that counts as information.
-# Smaller eigenvalues are rounding.
+# After scaling to ones on the diagonal, a smaller eigenvalue of normal equations is rounding, not
+# information.
 _MIN_INFORMATION = 1e-12
 
 
@@ -44,14 +44,14 @@ def transposed(blocks: FloatArray) -> FloatArray:
 def gram(blocks: FloatArray) -> FloatArray:
     """Return the products ``B' B`` (n, k, k) of blocks B (n, d, k).
 
-    numpy multiplies an array by its own transpose with a routine that takes three times as long for
-    small matrices. So one factor is a copy.
+    numpy has a special routine for the product of an array with its own transpose, which is three
+    times slower for small matrices. A copy of one factor avoids it.
     """
     return transposed(blocks) @ blocks.copy()
 
 
 def multiplied(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the products (k, l) of columns (n, d, k) with columns (n, d, l), summed over n, d."""
+    """Return the products (k, l) of columns (n, d, k) and (n, d, l), summed over n and d."""
     return first.reshape(-1, first.shape[2]).T @ second.reshape(
         -1, second.shape[2]
     )
@@ -87,7 +87,7 @@ def inverse_roots(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _triangular_inverses(lower: NDArray[np.floating]) -> FloatArray:
     """Return the inverses of lower triangular matrices (n, d, d) by forward substitution.
 
-    All matrices are eliminated at once, so their index is the last one in memory.
+    All matrices are eliminated together. Their index is the last one in memory.
     """
     rows = np.ascontiguousarray(lower.transpose(1, 2, 0))
     inverse = np.zeros_like(rows)
@@ -102,10 +102,10 @@ def _triangular_inverses(lower: NDArray[np.floating]) -> FloatArray:
 
 
 class _Round(NamedTuple):
-    """Blocks of the factor that one round of cyclic reduction eliminates.
+    """Blocks of the Cholesky factor that one round of cyclic reduction eliminates.
 
     ``inverse`` (m, d, d) is L_k^-1. ``before`` (m, d, d) and ``after`` (m or m - 1, d, d) couple
-    block k with its neighbours. The last eliminated block may have no neighbour after it.
+    block k to its neighbours. The last eliminated block may have no neighbour after it.
     """
 
     inverse: FloatArray
@@ -150,7 +150,7 @@ class Factor:
             diagonal[: len(before)] -= gram(before)
             diagonal[1 : 1 + n_after] -= gram(after)
             below = -transposed(after) @ before[:n_after]
-        # The blocks that remain become one dense matrix.
+        # The remaining blocks become one dense matrix.
         self._n_last, self._size, _ = diagonal.shape
         dense = np.zeros((self._n_last, self._size) * 2)
         blocks = np.arange(self._n_last)
@@ -182,7 +182,7 @@ class Factor:
     def restore(self, whitened: FloatArray) -> FloatArray:
         """Return ``L^-T`` times columns (n, d, k) that :meth:`whiten` returned.
 
-        The blocks of the result are in the order of the matrix. So ``restore(whiten(Z))`` is the
+        The blocks of the result are in the order of the matrix, so ``restore(whiten(Z))`` is the
         inverse of the matrix times Z.
         """
         start = len(whitened) - self._n_last
@@ -215,8 +215,8 @@ class Factor:
             n_eliminated = len(inverse)
             n_after = len(after)
             root = transposed(inverse)
-            # If the inverse is a covariance, an eliminated state is these matrices times its
-            # neighbours, plus independent noise of covariance root root'.
+            # If the inverse is a covariance, an eliminated state is the sum of these matrices times
+            # its neighbours and independent noise of covariance root root'.
             to_before = -root @ before
             to_after = -root[:n_after] @ after
             with_before = to_before @ diagonal[:n_eliminated]
@@ -241,16 +241,16 @@ class Factor:
 def prior_products(
     values: FloatArray, sigmas: FloatArray, size: int
 ) -> FloatArray:
-    """Return a prior with mean zero as products that are added to ``[J e]' V^-1 [J e]``.
+    """Return a prior with mean zero as products, to be added to ``[J e]' V^-1 [J e]``.
 
     Parameters
     ----------
     values : (k,) array
-        Present values of the last k parameters. The other parameters have no prior.
+        Current values of the last k parameters. The other parameters have no prior.
     sigmas : (k,) array
         Prior standard deviations of the last k parameters.
     size : int
-        Number of rows of the products: that of all parameters, plus 1 for the residuals.
+        Number of rows of the products: the number of all parameters, plus 1 for the residuals.
 
     Returns
     -------
@@ -287,16 +287,15 @@ class NormalEquations:
     cost : (...) array
         Weighted squared residual after the step.
     log_determinant : (...) array
-        Logarithm of the product of all eigenvalues of the information ``J' V^-1 J`` that are not
-        zero.
+        Logarithm of the product of all nonzero eigenvalues of the information ``J' V^-1 J``.
     """
 
     def __init__(self, products: FloatArray) -> None:
         information = products[..., :-1, :-1]
         gradient = products[..., :-1, -1]
         diagonal = np.einsum("...ii->...i", information)
-        # Scale the information to ones on the diagonal, because the units of parameters differ. A
-        # parameter below rounding has no information; its scale is arbitrary.
+        # Scale the information to ones on the diagonal, because parameters have different units. A
+        # parameter whose information is rounding counts as unobserved; its scale is arbitrary.
         largest = diagonal.max(axis=-1, keepdims=True)
         has_information = diagonal > np.finfo(float).eps * largest
         any_square = np.where(largest > 0.0, largest, 1.0)
@@ -307,7 +306,7 @@ class NormalEquations:
         kept = np.where(both_have, information, 0.0)
         scaled = scale[..., :, None] * kept * scale[..., None, :]
         values, vectors = np.linalg.eigh(scaled)
-        # Eigenvalues that are rounding become 1: log 1 = 0 adds nothing to the log determinant, and
+        # Replace eigenvalues that are rounding by 1: they add log 1 = 0 to the log determinant, and
         # the mask excludes them from the root.
         self._is_observed = values > _MIN_INFORMATION
         values = np.where(self._is_observed, values, 1.0)
@@ -324,7 +323,7 @@ class NormalEquations:
         self.log_determinant += self._log_unseen_scale()
 
     def _log_unseen_scale(self) -> FloatArray:
-        """Return (...) the share of directions without information in the scale, as a log.
+        """Return (...) log det(N' N), the effect of the scale on directions without information.
 
         The scaled information S I S has ones on its diagonal, so that S depends on the levels. Let
         N be the vectors S v of directions v without information. Then ``pdet(I) = pdet(S I S) /
@@ -341,6 +340,6 @@ class NormalEquations:
 
     @property
     def unseen(self) -> FloatArray:
-        """Unit vectors (p, U) of the U directions without information; only for one system."""
+        """Unit vectors (p, U) along the U directions without information, for a single system."""
         axes = self._axes[:, ~self._is_observed]
         return axes / np.linalg.norm(axes, axis=0)

@@ -1,8 +1,8 @@
 """Jumps, outlier poses, and heavy tails.
 
-The test quantities are the smoothed step w of the walk of each increment, and the smoothed white
-error v of each pose. For v with prior covariance S and posterior covariance S_post, the covariance
-of the smoothed v is S - S_post. Then
+The tests use the smoothed step w of the walk of each increment, and the smoothed white error v of
+each pose. If v has the prior covariance S and the posterior covariance S_post, the smoothed v has
+the covariance S - S_post. Then
 
     chi-square = v' (S - S_post)^-1 v
 
@@ -42,13 +42,14 @@ from hand_eye_calib.core.noise.state_space import (
 )
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# Smallest residual (m, rad) that may be a jump. Smaller residuals are rounding.
+# A smaller residual (m, rad) is rounding, not a jump.
 _MIN_JUMP = 1e-6
 
-# The diagonal of S - S_post is increased by this share of the diagonal of S, so that rounding does
-# not make it indefinite ...
+# The diagonal of S - S_post is increased by this share of the diagonal of S. Rounding could
+# otherwise make the matrix indefinite.
 _INCREASE_SHARE = 1e-9
-# ... and by this variance (m^2, rad^2), because S of positions or rotations alone may be singular.
+# The diagonal is also increased by this variance (m^2, rad^2): S may be singular for positions or
+# rotations alone.
 _INCREASE_VARIANCE = 1e-18
 
 
@@ -59,9 +60,9 @@ class Outliers:
     Attributes
     ----------
     jumps : (n,) bool array
-        Increments across which a trajectory jumps and does not return. They are not used.
+        Increments at which a trajectory jumps and does not return. They are not used.
     spikes : (N,) bool array
-        Outlier poses: a single pose is wrong, its neighbours are not. They are not used.
+        Outlier poses: the pose is wrong, but its neighbours are right. Outlier poses are not used.
     """
 
     jumps: BoolArray
@@ -70,17 +71,17 @@ class Outliers:
     def across(self, kept: IntArray, longest_gap: int) -> Outliers:
         """Return the outliers of the subset ``kept`` (indices of poses, ascending).
 
-        An increment between two kept poses is a jump if a jump is between them, or if they are
-        farther apart than ``longest_gap`` poses.
+        An increment between two kept poses is a jump if it contains a jump, or if it is longer than
+        ``longest_gap`` poses.
         """
-        # Whether there is a jump from each kept pose to the next one.
+        # Whether a jump is between each kept pose and the next kept pose.
         jumps = np.logical_or.reduceat(self.jumps[: kept[-1]], kept[:-1])
         return Outliers(
             jumps | (np.diff(kept) > longest_gap), self.spikes[kept]
         )
 
     def differs_by(self, other: Outliers) -> float:
-        """Return the share of poses at which only one of both sets has a jump or a spike."""
+        """Return the share of poses whose jump or spike is in only one of both sets."""
         differing = np.sum(self.jumps != other.jumps) + np.sum(
             self.spikes != other.spikes
         )
@@ -94,13 +95,12 @@ def first_outliers(
     residuals: FloatArray,
     tuning: Tuning,
 ) -> Outliers:
-    """Detect outliers in residuals (n, 6), before there is a noise model.
+    """Detect outliers in residuals (n, 6) before a noise model exists.
 
-    A residual is large beyond a multiple of its robust standard deviation. A large residual is a
-    jump, but a pose between two large residuals is an outlier, and they are no jumps. If the
-    trajectory also jumped there, the residual is still large after the pose was replaced: then the
-    increment after the pose is a jump, too. If too many poses would be outliers, all large
-    residuals are jumps.
+    A residual is large if it exceeds a multiple of its robust standard deviation. A pose between
+    two large residuals is an outlier; any other large residual is a jump. The outlier pose is
+    replaced. If the residual after it is still large, the increment after the pose is a jump, too.
+    If too many poses would be outliers, all large residuals are jumps.
     """
     lengths = _lengths(residuals)
     usual_lengths = np.array([median(column) for column in lengths.T])
@@ -128,11 +128,11 @@ def _lengths(residuals: FloatArray) -> FloatArray:
 def innovation_chi_squares(
     posterior: Posterior | PartwisePosterior, spikes: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the chi-squares of the increments (n,) and of the white errors of poses (N,).
+    """Return the chi-squares of the increments (n,) and of the poses' white errors (N,).
 
-    Each chi-square tests data against the prediction from all other data, earlier and later.
-    Outlier poses, ``spikes`` (N,), were not used. The chi-square is zero for an increment between
-    two parts of a long recording.
+    Each chi-square compares data with their prediction by all other data, earlier and later.
+    Outlier poses ``spikes`` (N,) are not used. An increment between two parts of a long recording
+    has the chi-square zero.
     """
     of_walk = []
     of_white = []
@@ -151,8 +151,8 @@ def _chi_squares_of_part(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the chi-squares of :func:`innovation_chi_squares` for one part of a recording."""
     space = posterior.space
-    # Column 0 is the posterior mean, the others are a root of the covariance that the uncertainty
-    # of the parameters adds.
+    # Column 0 is the posterior mean. The other columns are a root of the covariance that the
+    # uncertainty of the parameters adds.
     states, walk = posterior.smoothed()
     of_walk = chi_squares(
         walk[:, :, 0],
@@ -182,13 +182,14 @@ def chi_squares(
 ) -> FloatArray:
     """Return the chi-squares (n,) of smoothed values (n, 6).
 
-    ``prior`` and ``posterior`` (n, 6, 6) are the covariances of the values. The covariance of a
-    smoothed value is prior minus posterior. A value whose data are not used (``is_unused``) is an
-    estimate from all other data: the covariance of its difference from zero is their sum.
+    ``prior`` and ``posterior`` (n, 6, 6) are the covariances of the values. A smoothed value has
+    the covariance prior minus posterior. The values in ``is_unused`` are predictions from all other
+    data: their covariance is prior plus posterior.
     """
     covariances = prior - posterior
     covariances[is_unused] = prior[is_unused] + posterior[is_unused]
-    # Only on the diagonal: a prior of jitter, which acts along one velocity, is singular.
+    # Increase the diagonal only: the prior of jitter is singular, because jitter acts along one
+    # velocity.
     covariances += (_INCREASE_SHARE * prior + _INCREASE_VARIANCE) * np.eye(6)
     weighted = np.linalg.solve(covariances, values[:, :, None])[:, :, 0]
     return np.asarray((values * weighted).sum(axis=1))
@@ -203,20 +204,21 @@ def detect_outliers(
 ) -> Outliers:
     """Detect jumps and outlier poses by their chi-squares.
 
-    A new jump or outlier has a larger chi-square than its neighbours, poses and increments.
+    A new jump or outlier needs a chi-square larger than that of neighbouring poses and increments.
 
     Parameters
     ----------
     outliers : Outliers
-        Result of the previous detection. Outlier poses stay outliers; jumps stay jumps only while
-        their chi-square is large.
+        Result of the previous detection. Its outlier poses remain outliers. Its jumps remain jumps
+        if their chi-square is still large.
     of_walk, of_white : (n,) and (N,) arrays
         Chi-squares of increments and of poses, see :func:`innovation_chi_squares`.
     tuning : Tuning
     with_spikes : bool
         Whether to detect new outlier poses.
     """
-    # Tail probability of one test, so that all poses together have the expected false alarms.
+    # Tail probability of a single test. All poses together then have the expected number of false
+    # alarms.
     threshold = chi_square_quantile(tuning.false_alarms / len(of_white))
     jump_threshold = (
         _jump_factor(of_walk[~outliers.jumps], threshold, tuning) * threshold
@@ -235,10 +237,10 @@ def detect_outliers(
 def _jump_factor(
     of_walk: FloatArray, threshold: float, tuning: Tuning
 ) -> float:
-    """Return the factor of the threshold above which a chi-square of the walk is a jump.
+    """Return the factor of the threshold above which the chi-square of a step is a jump.
 
-    If the steps of the walk are normal, the factor is the ratio of their median chi-square to that
-    of the model, and at least 1. If the steps have heavy tails, the factor is larger.
+    For normal steps, the factor is the ratio of their median chi-square to that of the model, and
+    at least 1. For steps with heavy tails, the factor is a larger constant.
     """
     ordinary = of_walk[of_walk < threshold]
     if not len(ordinary):
@@ -250,7 +252,7 @@ def _jump_factor(
 
 
 def _is_peak(values: FloatArray) -> BoolArray:
-    """Return a mask of the values (n,) that are larger than both neighbours."""
+    """Return a mask of the values (n,) that exceed both neighbours."""
     padded = np.r_[0.0, values, 0.0]
     return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:])
 
@@ -258,10 +260,10 @@ def _is_peak(values: FloatArray) -> BoolArray:
 def bridge_outliers(
     streams: Streams, T_parent_child: FloatArray, spikes: BoolArray
 ) -> Streams:
-    """Replace each outlier pose of the child by the pose before, moved as the parent moved.
+    """Replace each outlier pose of the child by its previous pose, moved like the parent.
 
-    The state space ignores the error of an outlier pose. Yet the linearisation of the increments on
-    both sides is of first order, so that the large error must not be in the poses.
+    The state space ignores the error of an outlier pose. But the increments on both sides are
+    linearised to first order, which a large error would make invalid.
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
     outlier_poses = np.flatnonzero(spikes[1:]) + 1
@@ -278,9 +280,9 @@ def bridge_outliers(
 def tail_weights(posterior: Posterior | PartwisePosterior) -> FloatArray:
     """Return weights (N,) of the white errors v for Student's t distribution.
 
-    ``weight = (nu + 6) / (nu + E[v' S^-1 v])`` with nu = 4 degrees of freedom and the white
-    covariance S. The expectation is that of the smoothed v, plus a share that smoothing removes.
-    This share is assumed to be in inverse proportion to the weights of the poses.
+    ``weight = (nu + 6) / (nu + E[v' S^-1 v])``, with nu = 4 degrees of freedom and the white
+    covariance S. The expectation is v' S^-1 v of the smoothed v, plus a share that smoothing
+    removes. This share is assumed to be in inverse proportion to the weights of the poses.
     """
     return np.concatenate(
         [_tail_weights_of_part(part) for part in posterior.parts()]
@@ -294,7 +296,7 @@ def _tail_weights_of_part(posterior: Posterior) -> FloatArray:
     weights = posterior.space.weights
     is_outlier = weights == 0.0
     weighted_squares = (weights * squares)[~is_outlier]
-    # The mean square of a white error that is not smoothed is 6.
+    # Without smoothing, v' S^-1 v has the mean 6.
     remaining_share = min(float(np.mean(weighted_squares)) / WHITE, 1.0)
     removed = (
         WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)

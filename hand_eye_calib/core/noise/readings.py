@@ -1,20 +1,20 @@
-"""Comparison of two interpretations of the same poses by the likelihood of their noise.
+"""Comparison of two readings of the same poses by the likelihood of their noise.
 
-A *reading* interprets both streams as poses of the sensors, or as inverse poses. If all
-poses are inverted, A Y = Y B holds for the pose Y of one world in the other, and the residuals are
-as small as before. So residuals cannot decide between two readings, but the noise can. In the right
-reading, drift accumulates in the sensor frame, and rotation errors turn about the sensor, or about
+A *reading* interprets both streams as poses of the sensors, or both as inverse poses. If all poses
+are inverted, A Y = Y B holds for the pose Y of one world in the other world, with equally small
+residuals. So residuals cannot decide between two readings, but the noise can. In the right reading,
+drift accumulates in the frame of the sensor, and rotation errors turn about the sensor, or about
 the target of a camera. In the wrong reading, the same errors grow with the distance from the origin
 of a world.
 
 The losses of two readings are comparable under these conditions:
 
-- The data are motions, not poses. If the poses are inverted, the motions change by an adjoint of
-  determinant 1, so that the probability densities of both readings have the same unit.
+- The data are motions, not poses. An inversion of the poses changes the motions by an adjoint of
+  determinant 1, so the probability densities of both readings have the same unit.
 - Both readings ignore the same jumps and outlier poses, and have no robust weights.
-- Both readings have the same parameters with the same prior standard deviations.
-- Each reading has its best centre of rotation noise: a camera that observes a target has the same
-  white noise as the inverted poses of a tracker.
+- Both readings have the same parameters, with the same prior standard deviations.
+- Each reading has its own best centre of rotation noise: a camera that observes a target has the
+  white noise of the inverse poses of a tracker.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from hand_eye_calib.core.noise.increments import (
 from hand_eye_calib.core.noise.noise_model import CENTRES
 from hand_eye_calib.core.noise.outliers import Outliers, bridge_outliers
 
-# Largest number of poses that are used, evenly spread. The search takes about 1 ms per pose for
-# each reading (measured).
+# Largest number of poses that are used, evenly spread. Measured: the search takes about 1 ms per
+# pose and reading.
 _MAX_POSES = 1500
 
 
@@ -47,7 +47,7 @@ def loss_difference(
 ) -> float:
     """Return the loss of the second reading minus the loss of the first reading.
 
-    The loss is the restricted negative log likelihood of the noise.
+    The loss of a reading is the restricted negative log likelihood of its noise.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def loss_difference(
     numpy.linalg.LinAlgError
         If the noise model cannot be fitted to a reading.
     """
-    # Rounded up.
+    # The quotient is rounded up.
     stride = -(-len(stamps_ns) // _MAX_POSES)
     stamps_s = (stamps_ns - stamps_ns[0]) * 1e-9
     workspaces = []
@@ -90,10 +90,10 @@ def loss_difference(
 def _smallest_loss(
     workspace: Workspace, start: Fit, outliers: Outliers
 ) -> float:
-    """Return the smallest loss of a reading over all centres of rotation noise.
+    """Return the smallest loss of a reading over all centres of white rotation errors.
 
-    ``start`` is a fit of this reading. The search does not use the poses and increments in
-    ``outliers``, and has no robust weights.
+    ``start`` is a fit of this reading. The search ignores the poses and increments in ``outliers``,
+    and uses no robust weights.
     """
     streams = workspace.problem.streams
     n_poses = len(streams)
@@ -120,6 +120,6 @@ def _smallest_loss(
 
 
 def _loss(workspace: Workspace, fit: Fit) -> float:
-    """Return the restricted negative log likelihood, including the constant of the prior."""
+    """Return the restricted negative log likelihood with the constant term of the prior."""
     prior_sigmas = fit.sigmas[workspace.problem.columns]
     return workspace.posterior(fit).loss + float(np.log(prior_sigmas).sum())

@@ -1,16 +1,16 @@
 """Noise levels by restricted maximum likelihood (REML).
 
-The symbols are those of :mod:`hand_eye_calib.core.noise`. theta are the levels, the logarithms of
-variances and of time constants; V is the covariance of the residuals e. The loss is the restricted
+The symbols are those of :mod:`hand_eye_calib.core.noise`. theta are the levels: the logarithms of
+variances and of time constants. V is the covariance of the residuals e. The loss is the restricted
 negative log likelihood (Patterson, Thompson, Biometrika 58, 1971):
 
     loss = 1/2 (log|V| + e' P e + log|J' V^-1 J|)
     P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1
     d loss / d theta_k = 1/2 (tr(P V_k) - e' P V_k P e),      V_k = dV / d theta_k
 
-The prior of beta is part of the information ``J' V^-1 J``. The gradient is exact but for the prior
-of the processes, whose derivative is numerical. It needs only those blocks of the states'
-covariance that are on the diagonal and next to it. The curvature is the average information, the
+The information ``J' V^-1 J`` contains the prior of beta. The gradient is exact, except for the
+processes: the derivative of their prior is numerical. The gradient needs only the blocks of the
+states' covariance on the diagonal and next to it. The curvature is the average information, the
 mean of observed and expected information (Gilmour, Thompson, Cullis, Biometrics 51, 1995): ``1/2
 f_k' P f_l`` with ``f_k = V_k P e``.
 """
@@ -35,19 +35,20 @@ from hand_eye_calib.core.noise.state_space import (
 # Largest number of Newton steps of one search.
 MAX_STEPS = 20
 
-# Longest step of a level: a variance changes by a factor of 4.5 at most.
+# Longest step of a level. A variance changes at most by a factor of 4.5.
 _MAX_STEP = 1.5
-# A step that did not lower the loss is multiplied by this factor and tried again ...
+# A step that does not lower the loss is shortened by this factor and tried again ...
 _SHORTENING_FACTOR = 0.3
-# ... until it is shorter than this change of a level: a variance would change by 0.1 %.
+# ... unless it is shorter than this change of a level, which would change a variance by 0.1 %.
 _MIN_STEP = 1e-3
 
-# Information added to every level. It bounds the step of levels that have no influence on the loss.
+# Information that is added to every level. It limits the step of levels without influence on the
+# loss.
 _ADDED_INFORMATION = 0.05
 
 
 class Prior(NamedTuple):
-    """Gaussian prior of the levels, with bounds; arrays (m,)."""
+    """Gaussian prior of the levels (m,), with bounds."""
 
     mean: FloatArray
     precision: FloatArray
@@ -55,7 +56,7 @@ class Prior(NamedTuple):
     upper: FloatArray
 
     def loss(self, levels: FloatArray) -> float:
-        """Return the negative log density at levels (m,), without constants."""
+        """Return the negative log density at the levels (m,), without constants."""
         return 0.5 * float((self.precision * (levels - self.mean) ** 2).sum())
 
 
@@ -76,21 +77,21 @@ def fit(
     prior : Prior
         Prior and bounds of the levels.
     settled_loss : float
-        The search ends if a step is predicted to lower the loss by less than this.
+        The search ends if the next step is predicted to lower the loss by less than this.
     n_steps : int
         Largest number of steps.
 
     Returns
     -------
     Posterior
-        Posterior at the best levels.
+        Posterior at the levels with the smallest loss.
     (m, m) array
-        Average information on the levels, before the last step.
+        Average information on the levels before the last step.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If the covariance at the start is not positive definite to rounding.
+        If the covariance at the start is not positive definite up to rounding.
     """
     posterior = Posterior(space, np.clip(start, prior.lower, prior.upper))
     loss = posterior.loss + prior.loss(posterior.levels)
@@ -112,12 +113,12 @@ def fit(
 def _search_along(
     posterior: Posterior, step: FloatArray, prior: Prior, loss: float
 ) -> tuple[Posterior, float]:
-    """Take a step of the levels (m,), shortened until it lowers the loss.
+    """Take a step of the levels (m,), shortened if necessary until it lowers the loss.
 
     Returns
     -------
     Posterior
-        Posterior after the step; ``posterior`` itself if even the shortest step does not help.
+        Posterior after the step; ``posterior`` if even the shortest step does not lower the loss.
     float
         Decrease of the loss.
     """
@@ -137,9 +138,9 @@ def _newton_step(
     curvature: FloatArray,
     prior: Prior,
 ) -> FloatArray:
-    """Return the Newton step of the levels (m,), damped: no level moves by more than _MAX_STEP.
+    """Return the damped Newton step of the levels (m,). No level moves by more than _MAX_STEP.
 
-    A level does not move if it is at a bound and its descent direction crosses this bound.
+    A level at a bound stays there if its descent direction crosses the bound.
     """
     may_decrease = levels > prior.lower + 1e-9
     may_increase = levels < prior.upper - 1e-9
@@ -161,10 +162,10 @@ def _newton_step(
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Return the gradient (m,) of the loss and the average information (m, m) of the levels.
 
-    Let S be the prior covariance of white errors v, and E[v v'] their posterior second moments. The
-    derivative of the loss with respect to the level of a basis of S is ``1/2 exp(level) tr(D
-    basis)`` with ``D = S^-1 - S^-1 E[v v'] S^-1``, summed over all poses. The walk has a derivative
-    of the same form.
+    Let S be the prior covariance of the white errors v, and E[v v'] their posterior second moments.
+    The derivative with respect to the level of a basis of S is ``1/2 exp(level) tr(D basis)``, with
+    ``D = S^-1 - S^-1 E[v v'] S^-1`` summed over all poses. The derivative with respect to a level
+    of the walk has the same form.
     """
     states, walk = posterior.smoothed()
     white_D = _white_difference(posterior, states[:, :WHITE])
@@ -199,7 +200,7 @@ def _white_difference(posterior: Posterior, white: FloatArray) -> FloatArray:
 
 
 def _walk_difference(posterior: Posterior, walk: FloatArray) -> FloatArray:
-    """Return D (6, 6) of :func:`derivatives`, summed, for the smoothed walk (n, 6, 1 + p)."""
+    """Return D (6, 6) of :func:`derivatives` for the smoothed walk (n, 6, 1 + p), summed."""
     moments = posterior.walk_covariances() + walk @ transposed(walk)
     total = np.tensordot(posterior.walk_weights, moments, axes=1)
     precision = posterior.walk_precision
@@ -213,14 +214,14 @@ def _group_gradient(
     """Return numerical derivatives (2,) of the loss with respect to the two levels of a group.
 
     The levels are the log variance and the log time constant. The loss depends on them through
-    ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is their prior
-    precision, E[g g'] are their posterior second moments. The moments are constant here.
+    ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is the prior
+    precision of a process, and E[g g'] are its posterior second moments, which are constant here.
     """
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
     n_processes = values.shape[1]
-    # Second moments at each pose (N,), and between each pose and the pose before (n,), summed
-    # over the processes of the group.
+    # Second moments, summed over the processes of the group: at each pose (N,), and between each
+    # pose and the previous pose (n,).
     squares = np.einsum("nii->n", covariance[:, group.states, group.states])
     squares += np.einsum("nij,nij->n", values, values)
     products = np.einsum("nii->n", below[:, group.states, group.states])
@@ -240,9 +241,9 @@ def _group_gradient(
 def _average_information(
     posterior: Posterior, states: FloatArray, walk: FloatArray
 ) -> FloatArray:
-    """Return the average information (m, m) for the posterior means of states and walk.
+    """Return the average information (m, m), given the posterior means of states and walk.
 
-    It is ``1/2 f' P f = 1/2 (f' V^-1 f - f' V^-1 J (J' V^-1 J)^-1 J' V^-1 f)``.
+    It equals ``1/2 f' P f = 1/2 (f' V^-1 f - f' V^-1 J (J' V^-1 J)^-1 J' V^-1 f)``.
 
     Parameters
     ----------
@@ -265,7 +266,7 @@ def _average_information(
 def _working_columns(
     posterior: Posterior, states: FloatArray, walk: FloatArray
 ) -> FloatArray:
-    """Return the columns f_k (n, 6, m) of the average information, one for each level."""
+    """Return the columns f_k (n, 6, m) of the average information, one column per level."""
     space = posterior.space
     variances = np.exp(posterior.levels)
     n_white = len(space.white_bases)

@@ -3,8 +3,8 @@
 Data and state of the search are in :mod:`~hand_eye_calib.core.noise.fit`. :func:`start` returns the
 first fit; each stage is a function that takes a workspace and a fit and returns the next fit:
 
-1. :func:`noise`: all levels of the model, which has only white noise and a walk at first; and a
-   step of X;
+1. :func:`noise`: all levels of the model, which contains only white noise and a walk at first, and
+  a step of X;
 2. :func:`outliers`: jumps and outlier poses, which need noise levels;
 3. :func:`tails`: weights of white errors that have heavy tails;
 4. :func:`time_correlated`: Gauss-Markov processes, which must not explain outliers;
@@ -63,31 +63,32 @@ from hand_eye_calib.core.noise.tuning import Tuning
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.registry import Method
 
-# Newton steps of the search for time-correlated errors before processes without information are
+# Newton steps in the search for time-correlated errors, before processes without information are
 # dropped for the first time.
 _FIRST_STEPS = 4
 
-# A step of X (m, rad) that is shorter than this is rounding.
+# A shorter step of X (m, rad) is rounding.
 _ROUNDING_STEP = 1e-9
 
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
-    """Return the indices of poses that noise levels are fitted to, or None for all poses.
+    """Return the indices of the poses to which noise levels are fitted, or None for all poses.
 
-    The poses are in bursts that are spread evenly over the recording.
+    The poses form bursts, which are spread evenly over the recording.
     """
     if n_poses <= tuning.most_poses:
         return None
     burst = np.array(tuning.burst)
     n_bursts = tuning.most_poses // len(burst)
-    # A burst is at most twice as long as the distance between the starts of two bursts.
+    # A burst is at most twice as long as the distance between the starts of two neighbouring
+    # bursts.
     offsets = burst[2 * len(burst) * n_poses // tuning.most_poses > burst]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], n_bursts).astype(int)
     return np.unique(starts[:, None] + offsets)
 
 
 def start(problem: Problem) -> Fit:
-    """Return the first fit: X by DNLO, first jumps and outliers, rough noise levels."""
+    """Return the first fit: X from DNLO, first jumps and outliers, rough noise levels."""
     streams = problem.streams
     tuning = problem.tuning
     pairs = motion_pairs(
@@ -119,9 +120,9 @@ def start(problem: Problem) -> Fit:
 def _centre_of_rotations(
     streams: Streams, T: FloatArray, residuals: FloatArray
 ) -> str:
-    """Return the point of CENTRES at which the translations of residuals (n, 6) are smallest.
+    """Return the centre (CENTRES) about which the translations of residuals (n, 6) are smallest.
 
-    White rotation errors turn about this point.
+    White rotation errors turn about this centre.
     """
     translations = residuals[:, :3]
     rotations = residuals[:, 3:]
@@ -138,9 +139,9 @@ def _centre_of_rotations(
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:
-    """Fit all levels of the model, then take one step of X, both on a sample of the poses.
+    """Fit all levels of the model on a sample of the poses, then take a step of X on this sample.
 
-    Systematic errors do not change.
+    Systematic errors stay constant.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -163,8 +164,8 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
         detected = _detect_in_rounds(workspace, noise(workspace, detected), 1)
     spikes = detected.outliers.spikes
     if np.mean(spikes) > tuning.max_outlier_share:
-        # Not single poses, but long stretches are noisy. Weights of heavy tails replace outliers,
-        # unless the stage `tails` is skipped.
+        # So many outliers are not single poses, but long noisy stretches. Weights for heavy tails
+        # replace the outliers, unless the stage `tails` is skipped.
         detected = replace(
             detected,
             outliers=Outliers(detected.outliers.jumps, np.zeros_like(spikes)),
@@ -178,9 +179,9 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
 def _detect_in_rounds(
     workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True
 ) -> Fit:
-    """Detect jumps and outlier poses, at most ``rounds`` times, until few of them change.
+    """Detect jumps and outlier poses until few of them change, at most ``rounds`` times.
 
-    Without spikes, detect only jumps: outlier poses have small weights then.
+    Without spikes, only jumps are detected: in this case outlier poses have small weights.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -219,19 +220,19 @@ def _detect_in_rounds(
 def _expected_states(workspace: Workspace, fit: Fit) -> FloatArray:
     """Return the expected states (N, d) after the next step of the parameters.
 
-    A function of its own, so that the caller has no reference to the posterior: two posteriors of a
-    long recording would fill the memory.
+    This is a separate function, so that the caller keeps no reference to the posterior: two
+    posteriors of a long recording would fill the memory.
     """
     posterior = workspace.posterior(fit)
     return posterior.states_after(posterior.normal.step)
 
 
 def tails(workspace: Workspace, fit: Fit) -> Fit:
-    """Weight white errors by Student's t distribution if they have heavy tails."""
+    """Weight the white errors by Student's t distribution if they have heavy tails."""
     if not fit.has_heavy_tails:
         return fit
     for _ in range(2):
-        # Three rounds of weights at constant levels.
+        # The weights need three rounds. The levels stay constant.
         for _ in range(3):
             fit = replace(fit, weights=tail_weights(workspace.posterior(fit)))
         fit = noise(workspace, fit)
@@ -241,17 +242,17 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
 def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
     """Add time-correlated errors to the model if they lower the loss enough.
 
-    The search begins with all processes. Processes on which the data have no information are
-    dropped after some steps, so that the other steps are faster, and again at the end.
+    The search begins with all processes. Processes without information are dropped twice: after the
+    first steps, so that the remaining steps are faster, and at the end.
     """
     problem = workspace.problem
     tuning = problem.tuning
     kept = sample(len(problem.streams), tuning)
-    # Allow large biases. Otherwise a process would explain a constant bias.
+    # Allow large biases. Otherwise a process would explain a constant bias as its own.
     free = replace(fit, sigmas=np.array(tuning.sizes))
     loss_before = Posterior(problem.space(free, kept), fit.levels).loss
-    # At the start, white noise and walk have at least a share of the variance of an increment, so
-    # that the loss depends on their levels.
+    # White noise and walk start with at least a share of the variance of an increment, so that the
+    # loss depends on their levels.
     lowest = increment_levels(fit.levels) + np.log(tuning.start_share)
     levels = fit.levels.copy()
     levels[WHITES] = np.maximum(levels[WHITES], lowest)
@@ -267,7 +268,7 @@ def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
         )
         matters = np.diag(information)[VARIANCES] > tuning.min_information
         if n_steps == _FIRST_STEPS:
-            # A process whose level has risen may get information in the other steps.
+            # A process whose level has risen may gain information in the remaining steps.
             matters |= (fitted.levels > rival.levels)[VARIANCES]
         rival = _with_processes(rival, fitted.levels, matters)
     if loss_before - fitted.loss < tuning.least_gain:
@@ -276,13 +277,13 @@ def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _with_processes(fit: Fit, levels: FloatArray, is_kept: BoolArray) -> Fit:
-    """Return the fit at given levels, with a subset of its K time-correlated errors.
+    """Return the fit at given levels, with some of its K time-correlated errors.
 
     Parameters
     ----------
     fit : Fit
     levels : (m,) array
-        Levels of all K processes and of the other errors.
+        Levels of all K processes and of all other errors.
     is_kept : (K,) bool array
     """
     processes = tuple(compress(fit.model.processes, is_kept))
@@ -293,10 +294,10 @@ def _with_processes(fit: Fit, levels: FloatArray, is_kept: BoolArray) -> Fit:
 
 
 class _Hypothesis(NamedTuple):
-    """Set of systematic errors that may be present.
+    """Set of systematic errors that are assumed to be present.
 
-    ``fit`` contains their prior standard deviations, ``normal`` is its solution, and ``loss`` is
-    minus twice the log evidence.
+    ``fit`` contains the prior standard deviations of the errors, and ``normal`` is its solution.
+    ``loss`` is minus twice the log evidence.
     """
 
     fit: Fit
@@ -305,11 +306,11 @@ class _Hypothesis(NamedTuple):
 
 
 def systematic(workspace: Workspace, fit: Fit) -> Fit:
-    """Choose the likeliest set of systematic errors, then take a step of X and of these errors.
+    """Choose the likeliest systematic errors, then take a step of X and of these errors.
 
-    The child's path has a scale, or a bias along one of its axes, or neither of them. Each of these
-    sets is tried with and without a time offset. The smoothed errors c are removed from
-    the poses; systematic errors stay parameters.
+    The child's path has a scale, a bias along one of its axes, or none of them. Each of these sets
+    is tried with and without a time offset. The smoothed errors c are removed from the poses.
+    Systematic errors remain parameters.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -327,7 +328,8 @@ def systematic(workspace: Workspace, fit: Fit) -> Fit:
         gain = plain.loss - rival.loss
         if column != SCALE:
             gain *= tuning.bias_gain_share
-        # Largest ratio of the variances of X with and without the error, over all directions.
+        # Ratios of the variances of X with and without the error. The largest over all directions
+        # counts.
         ratios = plain_information @ rival.normal.covariance[:6, :6]
         growth = np.linalg.eigvals(ratios).real.max()
         if growth < tuning.max_sigma_growth**2 and gain > largest_gain:
@@ -345,11 +347,11 @@ def _likeliest(
     posterior: Posterior | PartwisePosterior,
     path_columns: list[int],
 ) -> _Hypothesis:
-    """Return the likelier hypothesis: some errors of the path, with or without a time offset.
+    """Return the likelier hypothesis: the given errors of the path, with or without a time offset.
 
-    The noise levels were fitted with other systematic errors. So the evidence integrates over a
-    common factor of all variances, whose prior counts as much as all residuals. The evidence is
-    then that of Student's t distribution.
+    The noise levels were fitted with other systematic errors. Therefore the evidence integrates
+    over a common factor of all variances, and is that of Student's t distribution. The prior of the
+    factor counts as much as all residuals.
 
     Parameters
     ----------
@@ -358,19 +360,19 @@ def _likeliest(
     posterior : Posterior
         Posterior of the fit.
     path_columns : list of int
-        Indices of the errors of the path that are present.
+        Indices of the errors of the path that are assumed to be present.
     """
     tuning = problem.tuning
     choices_of_time = [[], [TIME]] if TIME in problem.columns else [[]]
     if problem.is_clock_free:
-        # An estimated clock offset has an error for sure.
+        # The clock offset was estimated, so its error is certainly present.
         choices_of_time = choices_of_time[-1:]
     products = posterior.products - problem.prior(fit)
     n_rows = 6.0 * len(problem.streams)
     hypotheses = []
     for time_columns in choices_of_time:
         present = path_columns + time_columns
-        # A bias of rates is always present.
+        # The bias of the angular rates is always present.
         is_present = [k in present or k in RATE for k in range(N_SYSTEMATIC)]
         rival = replace(
             fit, sigmas=np.where(is_present, tuning.sizes, tuning.absent_sigma)
@@ -384,7 +386,7 @@ def _likeliest(
 
 
 def polish(workspace: Workspace, fit: Fit) -> Fit:
-    """Take steps of X and of systematic errors until X settles or max_rounds is reached."""
+    """Take steps of X and of systematic errors until X settles, at most ``max_rounds`` times."""
     problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
         if is_settled(workspace, fit):
@@ -394,7 +396,7 @@ def polish(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _take_step(workspace: Workspace, fit: Fit) -> Fit:
-    """Take one step of all parameters, and remove the expected errors from the poses."""
+    """Take one step of all parameters. Remove the expected errors from the poses."""
     problem = workspace.problem
     posterior = workspace.posterior(fit)
     if fit.has_heavy_tails and "tails" not in problem.without:
@@ -405,14 +407,14 @@ def _take_step(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def is_settled(workspace: Workspace, fit: Fit) -> bool:
-    """Return whether the next step of all parameters is small relative to their sigmas.
+    """Return whether the next step of each parameter is small relative to its standard deviation.
 
-    A translation of X with a large standard deviation need not settle: the motion does not excite
-    its direction.
+    A direction in which the translation of X has a large standard deviation need not settle: the
+    motion does not excite it.
     """
     tuning = workspace.problem.tuning
     normal = workspace.posterior(fit).normal
-    # The translation is compared along its principal axes.
+    # Compare the translation along its principal axes.
     steps = normal.step.copy()
     variances = np.diag(normal.covariance).copy()
     variances[:3], axes = np.linalg.eigh(normal.covariance[:3, :3])
@@ -423,7 +425,7 @@ def is_settled(workspace: Workspace, fit: Fit) -> bool:
     return bool((np.abs(steps) < limits).all())
 
 
-# Function of a stage of the search.
+# Function that runs a stage of the search.
 Stage: TypeAlias = Callable[[Workspace, Fit], Fit]
 STAGES: tuple[Stage, ...] = (
     noise,

@@ -7,12 +7,12 @@ white error v_i and of all processes g_ik, with ``phi_ik = exp(-dt_i / tau_k)``.
 
     H1_i = [I, M_{i+1}],      H0_i = Ad(B_i^-1) [I, M_i]
 
-A process that is an error of the path (a drifting scale or direction) acts on the increment itself:
-its columns are 0 in H1_i, and minus the derivative of e_i in H0_i.
+A process that is an error of the path (a drifting scale or direction) acts on the increment itself.
+Its columns are 0 in H1_i, and minus the derivative of e_i in H0_i.
 
-Pi is the prior precision of all states, W is the precision of w, and V is the covariance of
-``e + J beta``. The posterior precision Lambda of the states is block tridiagonal. For any matrix Z
-with the rows of e,
+Pi is the prior precision of all states, W the precision of w, and V the covariance of ``e + J
+beta``. The posterior precision Lambda of the states is block tridiagonal. For any matrix Z with as
+many rows as e,
 
     Lambda = Pi + U' W U
     log|V| = log|Lambda| - log|Pi| - log|W|
@@ -42,30 +42,30 @@ from hand_eye_calib.core.noise.normal import (
     transposed,
 )
 
-# Number of states of a pose that are its white error: three of translation, three of rotation.
+# Number of states for the white error of a pose: three of translation, three of rotation.
 WHITE = 6
 
-# Relative increase of the diagonal of Lambda, so that rounding does not make Lambda indefinite.
+# Relative increase of the diagonal of Lambda. Rounding could otherwise make Lambda indefinite.
 _DIAGONAL_INCREASE = 1e-13
 
-# Change of a level for numerical derivatives. The errors of truncation and of rounding are both
-# about 1e-10 then.
+# Change of a level in numerical derivatives. The errors of truncation and of rounding are then both
+# about 1e-10.
 LEVEL_CHANGE = 1e-5
 
-# Largest number of blocks of time that a recording is divided into for the jackknife.
+# Largest number of blocks of time for the jackknife.
 MAX_BLOCKS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class StateSpace:
-    """Linear state space of N poses, n = N - 1 increments, d states per pose and p parameters.
+    """Linear state space: N poses, n = N - 1 increments, d states per pose, p parameters.
 
     Attributes
     ----------
     intervals_s : (n,) array
         Durations of the increments.
     walk_factors : (n,) array
-        Variance of the walk over each increment, divided by that over a typical increment.
+        Variance of the walk over each increment, divided by its variance over a typical increment.
     columns : (n, 6, p + 1) array
         ``[J e]``: derivatives with respect to the parameters beta, then the residuals.
     h1_processes : (n, 6, d - 6) array
@@ -73,18 +73,18 @@ class StateSpace:
     h0 : (n, 6, d) array
         Matrices H0.
     white_bases : tuple of (1 or N, 6, 6) arrays
-        The covariance of a white error is ``sum exp(level) basis``, a basis for each level.
+        The covariance of a white error is ``sum exp(level) basis``, with one level per basis.
     walk_bases : tuple of (6, 6) arrays
         The covariance of the walk over a typical increment is a sum of the same form.
     group_sizes : tuple of int
-        Number of processes in each group. The processes of a group are independent and share a
-        variance and a time constant. In a state, the groups follow the white error in this order.
+        Number of processes in each group. The processes of a group are independent, with a common
+        variance and time constant. In a state, the groups follow the white error in this order.
     weights : (N,) array
-        Factor of the precision of each white error. For zero, an outlier pose, the precision is
-        the identity instead (a prior of 1 m and 1 rad, in effect none).
+        Factor of the precision of each white error. Outlier poses have the factor zero; their
+        precision is the identity instead (a prior of 1 m and 1 rad, in effect none).
     cut : (n,) bool array
-        Increments without information: jumps; in a sample of the poses, also increments over too
-        many left-out poses.
+        Increments without information: jumps, and in a sample of the poses also increments over too
+        many omitted poses.
     prior : (p + 1, p + 1) array
         Prior of the parameters, as products that are added to ``[J e]' V^-1 [J e]``.
     """
@@ -104,7 +104,7 @@ class StateSpace:
     def white_precision(
         self, levels: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Invert the covariances of the white errors, without the weights of poses.
+        """Invert the covariances of the white errors; the weights of the poses are left out.
 
         Returns
         -------
@@ -144,15 +144,14 @@ class StateSpace:
 
 
 class Markov:
-    """Group of independent Gauss-Markov processes with one variance and one time constant.
+    """Group of independent Gauss-Markov processes with a common variance and time constant.
 
-    The block (N, N) of Pi for one process, its prior precision at all poses, is tridiagonal. Here,
-    Pi is this block.
+    In this class, Pi is the prior precision (N, N) of one process at all poses. It is tridiagonal.
 
     Parameters
     ----------
     states : slice
-        Places of the processes of this group in the state of a pose.
+        Indices of the processes of this group in the state of a pose.
     levels : (2,) array
         Logarithms of the stationary variance and of the time constant (s).
     intervals_s : (n,) array
@@ -162,9 +161,8 @@ class Markov:
     first : float
         Precision of the value at the first pose: the inverse of the stationary variance.
     after, between, before : (n,) arrays
-        Contributions of each increment to Pi: to the diagonal element of the pose after the
-        increment, to the element below the diagonal, and to the diagonal element of the pose
-        before the increment.
+        Contributions of each increment to Pi: to the diagonal element of its last pose, to the
+        element below the diagonal, and to the diagonal element of its first pose.
     diagonal : (N,) array
         Diagonal of Pi. The elements below the diagonal are ``between``.
     log_determinant : float
@@ -190,7 +188,7 @@ class Markov:
         self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
 
     def changed(self, change: FloatArray) -> Markov:
-        """Return the same group at levels that differ by ``change`` (2,)."""
+        """Return the same group, with its levels changed by ``change`` (2,)."""
         return Markov(self.states, self._levels + change, self._intervals_s)
 
     def forces(self, values: FloatArray) -> FloatArray:
@@ -203,7 +201,7 @@ class Markov:
     def derivative_by_log_tau(self, values: FloatArray) -> FloatArray:
         """Return ``(d Pi^-1 / d log tau) Pi values`` (N, k) for the values (N, k) of k processes.
 
-        It equals ``-Pi^-1 (d Pi / d log tau) values``; the derivative of Pi is numerical.
+        The result equals ``-Pi^-1 (d Pi / d log tau) values``. The derivative of Pi is numerical.
         """
         change = np.array([0.0, LEVEL_CHANGE])
         forces = self.changed(change).forces(values) - self.changed(
@@ -217,14 +215,14 @@ class Markov:
 
 
 class Posterior:
-    """Posterior of states and parameters, and their likelihood, at given levels.
+    """Posterior of states and parameters at given levels, and the likelihood of these levels.
 
     Parameters
     ----------
     space : StateSpace
     levels : (m,) array
-        Logarithms of the variances of the white bases and of the walk bases; then of the variance
-        and the time constant (s) of every group.
+        Log variances of the white bases and of the walk bases; then log variance and log time
+        constant (s) of each group.
 
     Attributes
     ----------
@@ -233,17 +231,17 @@ class Posterior:
     walk_covariance, walk_precision : (6, 6) arrays
         Covariance of the walk over a typical increment, and its inverse.
     walk_weights : (n,) array
-        W of increment i is ``walk_weights[i] walk_precision``; zero for increments without
-        information.
+        The precision W of increment i is ``walk_weights[i] walk_precision``; zero for increments
+        without information.
     groups : list of Markov
     factor : Factor
         Cholesky factor L of Lambda. Its ``selected_inverse`` contains the covariances of the states
-        for known parameters: of each pose (N, d, d), and between each pose and the pose before
+        for known parameters: at each pose (N, d, d), and between each pose and the previous pose
         (n, d, d).
     log_determinant : float
         log|V|, with V restricted to the increments that have information.
     whitened : (N, d, p + 1) array
-        Y of Z = [J e].
+        Y for Z = [J e].
     products : (p + 1, p + 1) array
         ``[J e]' V^-1 [J e]``, plus the prior of the parameters.
     normal : NormalEquations
@@ -255,7 +253,7 @@ class Posterior:
     Raises
     ------
     numpy.linalg.LinAlgError
-        If a matrix at these levels is not positive definite to rounding.
+        If a matrix at these levels is not positive definite up to rounding.
     """
 
     def __init__(self, space: StateSpace, levels: FloatArray) -> None:
@@ -269,7 +267,7 @@ class Posterior:
         self._white_precisions = (
             space.weights[:, None, None] * self.white_precision
         )
-        # An identity in place of zeros keeps Pi invertible; its log determinant is zero.
+        # The identity instead of zeros keeps Pi invertible. Its log determinant is zero.
         self._white_precisions[is_free] = np.eye(WHITE)
         self.walk_covariance = total_covariance(
             levels[n_white:], space.walk_bases
@@ -294,7 +292,7 @@ class Posterior:
         self.loss = 0.5 * float(determinants + self.normal.cost)
 
     def _groups(self, first_level: int) -> list[Markov]:
-        """Return all groups of processes; ``first_level`` is the index of their first level."""
+        """Return all groups of processes. ``first_level`` is the index of their first level."""
         groups = []
         state = WHITE
         level = first_level
@@ -314,7 +312,8 @@ class Posterior:
     def _factorised(self) -> Factor:
         """Return the Cholesky factor of Lambda.
 
-        The blocks of Lambda are as large as the factor. They are local, so that they are released.
+        The blocks of Lambda are as large as the factor. They are local variables, so their memory
+        is released.
         """
         diagonal, below = self._precision_blocks(0, len(self.space.cut))
         np.einsum("nii->ni", diagonal)[:] *= 1.0 + _DIAGONAL_INCREASE
@@ -337,11 +336,11 @@ class Posterior:
     def _precision_blocks(
         self, start: int, end: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the contribution of m increments, from pose ``start`` to pose ``end``, to Lambda.
+        """Return the contribution to Lambda of m increments, from pose ``start`` to pose ``end``.
 
-        The blocks on the diagonal are (m + 1, d, d), those below it (m, d, d). The prior precision
-        of a pose counts with the increment before the pose; that of the very first pose, with the
-        first increment.
+        The blocks on the diagonal are (m + 1, d, d), the blocks below it (m, d, d). The prior
+        precision of a pose belongs to the increment before the pose; that of the very first pose
+        belongs to the first increment.
         """
         space = self.space
         increments = slice(start, end)
@@ -379,14 +378,14 @@ class Posterior:
     def forward_half(
         self, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) of columns Z (n, 6, k)."""
+        """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) for columns Z (n, 6, k)."""
         weighted = self._walk_precisions @ columns
         return weighted, self.factor.whiten(
             self.space.apply_u_transposed(weighted)
         )
 
     def parts(self) -> Iterator[Posterior]:
-        """Return the parts of a long recording; here, the whole recording is one part."""
+        """Return the parts of a long recording. Here the whole recording is a single part."""
         yield self
 
     def states_after(self, step: FloatArray) -> FloatArray:
@@ -397,8 +396,8 @@ class Posterior:
     def smoothed(self) -> tuple[FloatArray, FloatArray]:
         """Return the smoothed states (N, d, 1 + p) and walk (n, 6, 1 + p).
 
-        The first column is the posterior mean. The other columns are a root of the covariance that
-        the uncertainty of the parameters adds: the sum of their outer products.
+        The first column is the posterior mean. The sum of the outer products of the other columns
+        is the covariance that the uncertainty of the parameters adds.
         """
         normal = self.normal
         size = len(normal.step)
@@ -425,26 +424,26 @@ class Posterior:
         return total
 
     def part_products(self, n_blocks: int = MAX_BLOCKS) -> FloatArray:
-        """Return the contribution of each block of time to ``products``, for a jackknife.
+        """Return the contribution of each block of time to ``products``, for the jackknife.
 
-        A contribution is that of the innovations of a block, predicted from all earlier blocks. If
-        the model is right, the contributions are independent of each other. A jackknife that only
-        drops the increments of a block would overestimate the error: it would cut the trajectory,
-        although the white noise of the poses carries most information across the gap.
+        A contribution consists of the innovations of a block, predicted from all earlier blocks. If
+        the model is right, the contributions are independent. A jackknife that only drops the
+        increments of a block would overestimate the error: it would cut the trajectory, although
+        the white noise of the poses transports most information across the gap.
 
-        Each block becomes a quadratic form of the states at its two ends and of the columns; the
-        states between are eliminated. The forms are added in order of time. Each contribution
-        contains an equal share of the prior of the parameters.
+        Each block becomes a quadratic form of the states at both of its ends and of the columns,
+        after elimination of the states between. The forms are added in order of time. Each
+        contribution contains an equal share of the prior of the parameters.
 
         Returns
         -------
         (K, p + 1, p + 1) array
-            K is at most ``n_blocks``. The sum over K equals ``products``.
+            There are K <= ``n_blocks`` contributions. Their sum is ``products``.
         """
         n, _, n_columns = self.space.columns.shape
         n_states = self.space.h0.shape[2]
         ends = np.linspace(0, n, min(n_blocks, n) + 1).astype(int).tolist()
-        # Form of the state at the end of the last block, and of the columns.
+        # Quadratic form of the state at the end of the last block, and of the columns.
         history = np.zeros((n_states + n_columns, n_states + n_columns))
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in pairwise(ends):
@@ -462,9 +461,9 @@ class Posterior:
     def _form_between(self, start: int, end: int) -> FloatArray:
         """Return the quadratic form of the increments from pose ``start`` to pose ``end``.
 
-        It is a symmetric matrix (2 d + p + 1, 2 d + p + 1). Its rows belong to the state at
-        ``start``, the state at ``end``, and the columns [J e]. The states between are eliminated.
-        Earlier increments are not included.
+        The form is a symmetric matrix (2 d + p + 1, 2 d + p + 1). Its rows belong to the state at
+        ``start``, the state at ``end``, and the columns [J e]. The states between were eliminated.
+        Increments before ``start`` are not included.
         """
         space = self.space
         increments = slice(start, end)
@@ -506,7 +505,7 @@ def combined(columns: FloatArray, mixing: FloatArray) -> FloatArray:
 def total_covariance(
     levels: FloatArray, bases: tuple[FloatArray, ...]
 ) -> FloatArray:
-    """Return the sum of ``exp(level) basis`` over all bases. Further levels are ignored."""
+    """Return the sum of ``exp(level) basis`` over all bases. Surplus levels are ignored."""
     total = np.exp(levels[0]) * bases[0]
     for level, basis in zip(levels[1:], bases[1:], strict=False):
         total = total + np.exp(level) * basis
