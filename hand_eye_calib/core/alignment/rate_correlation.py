@@ -1,8 +1,8 @@
 """Correlation of the angular rates of two streams over all offsets of their clocks.
 
-Model: two sensors on one rigid body rotate by the same angle in the same time, however they are
-mounted. So the offset of the child's clock maximises the correlation of the angular rates. It needs
-no extrinsic, no common world, no common scale and no particular order of quaternions, because
+Model: two sensors on one rigid body rotate by the same angle in the same time, for any mounting. So
+the correlation of the angular rates is largest at the offset of the child's clock. It needs no
+extrinsic, no common world and no common scale. The order of quaternions does not matter, because
 reordered or inverted quaternions have the same angles.
 """
 
@@ -16,8 +16,8 @@ from hand_eye_calib.core.base.stats import quantile
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory, repetitions
 
-# Angles are measured over windows of this number of sampling steps, so that the noise of single
-# poses does not exceed the motion.
+# Angles are measured over windows of this number of sampling steps. In shorter windows the noise of
+# single poses may exceed the motion.
 _WINDOW_STEPS = 3
 
 # Smallest length of a window (s).
@@ -31,8 +31,8 @@ _MAX_STEP_S = 1.0
 # Largest number of sampling steps. Longer recordings have longer steps.
 _MAX_SAMPLES = 200_000
 
-# Share of the windows, those with the largest angular rates, whose rates are clipped: they may be
-# jumps of a stream instead of motion.
+# The largest rates are clipped in this share of the windows: they may be jumps of a stream instead
+# of motion.
 _CLIPPED_SHARE = 0.03
 
 # An offset is possible if both streams overlap for this share of the shorter stream ...
@@ -40,23 +40,22 @@ _MIN_OVERLAP_SHARE = 0.25
 # ... and for this time (s).
 _MIN_OVERLAP_S = 5.0
 
-# Half width of the peak of the correlation in seconds. Offsets nearer to the best offset are part
-# of the same peak, and no rivals.
+# Half width (s) of the peak of the correlation. Offsets within the peak do not count as rivals.
 _PEAK_WIDTH_S = 2.0
-# Half width of the peak in windows, if that is wider.
+# Half width of the peak in windows, if this is wider.
 _PEAK_WIDTH_WINDOWS = 5.0
 
-# Smallest ratio of the significance of the best offset to that of its best rival. In sixteen real
-# recordings the ratio was 5 to 12 for streams of one body, and at most 1.3 for unrelated streams.
+# Smallest ratio between the significances of the best offset and of its best rival. In sixteen real
+# recordings it was 5 to 12 for streams of one body, and at most 1.3 for unrelated streams.
 _MIN_DISTINCTNESS = 2.0
 
-# Smallest correlation coefficient of angular rates at a trusted offset.
+# Smallest correlation coefficient of the angular rates at an offset that is trusted.
 _MIN_CORRELATION = 0.5
 
-# Shortest repetition of a pose (s) that may come from a frozen stream.
+# A repeated pose may come from a frozen stream if the repetition lasts at least this time (s).
 _MIN_REPETITION_S = 1.0
 
-# Smallest standard deviation of an angular rate (rad/s) for a correlation.
+# Rates are correlated only if their standard deviation (rad/s) exceeds this limit.
 MIN_VARIATION = 0.01
 
 
@@ -69,17 +68,16 @@ class Correlation:
     Attributes
     ----------
     offset_s : float
-        Offset (s) with the best correlation, to be added to the child's stamps. It is accurate to
-        about a tenth of a sampling step.
+        Offset (s) with the best correlation, to be added to the child's stamps. Its error is about
+        a tenth of a sampling step.
     correlation : float
         Correlation coefficient of the angular rates at this offset.
     distinctness : float
-        Significance of this offset over that of its best rival, which is the best offset outside
-        the peak.
+        Significance of this offset divided by that of the best offset outside the peak.
     variation : float
-        Standard deviation of the angular rate (rad/s) of the stream that varies less.
+        Standard deviation (rad/s) of the angular rate, in the stream with the smaller variation.
     ratio : float
-        Ratio of the child's angular rates to the parent's.
+        Angular rates of the child divided by those of the parent.
     """
 
     offset_s: float = 0.0
@@ -94,9 +92,9 @@ class Correlation:
         return not self.doubt()
 
     def doubt(self, quantity: str = "angular rates") -> str:
-        """Return the reason why the offset cannot be trusted; empty if it can.
+        """Return the reason why the offset cannot be trusted; empty if it can be trusted.
 
-        ``quantity`` is the name of the correlated rates, for the text.
+        ``quantity`` names the correlated rates in the text.
         """
         if self.variation < MIN_VARIATION:
             return "the streams hardly rotate, or rotate at a constant rate"
@@ -119,10 +117,10 @@ def correlate_rates(
     max_gap_s: float = CalibratorConfig.max_gap,
     of_speed: bool = False,
 ) -> Correlation:
-    """Find the clock offset with the best correlation of the angular rates of two streams.
+    """Find the clock offset with the best correlation of the angular rates.
 
-    The stamps of the streams need not overlap. If poses of a frozen stream are repeated, they may
-    hide the offset; they are left out in a second attempt.
+    The stamps of the streams need not overlap. Repeated poses of a frozen stream may hide the
+    offset; a second attempt leaves them out.
 
     Parameters
     ----------
@@ -130,12 +128,12 @@ def correlate_rates(
     max_gap_s : float
         Windows that overlap a longer gap (s) between poses are left out.
     of_speed : bool
-        Correlate speeds instead, for a sensor without orientation.
+        Correlate speeds instead of angular rates, for a sensor without orientation.
 
     Returns
     -------
     Correlation
-        The best correlation; the default if a stream is too short.
+        The best correlation; the default values if a stream is too short.
     """
     if min(len(parent), len(child)) < 4:
         return Correlation()
@@ -171,7 +169,7 @@ def correlate_rates(
 def _shorter_s(
     parent_rates: FloatArray, child_rates: FloatArray, step_s: float
 ) -> float:
-    """Return the total duration (s) of finite rates, of the stream with fewer finite rates."""
+    """Return the total time (s) with finite rates, of the stream with less of it."""
     n_of_parent = np.isfinite(parent_rates).sum()
     n_of_child = np.isfinite(child_rates).sum()
     return min(n_of_parent, n_of_child) * step_s
@@ -180,7 +178,7 @@ def _shorter_s(
 def _clear_repetitions(
     stream: Trajectory, rates: FloatArray, step_s: float, window_s: float
 ) -> None:
-    """Set those of the rates (M,) to NaN whose windows contain a repeated pose of a stream."""
+    """Set the rates (M,) of windows that contain a repeated pose to NaN."""
     start_ns = int(stream.stamps_ns[0])
     for from_ns, until_ns in repetitions(stream, _MIN_REPETITION_S):
         first = max(
@@ -204,9 +202,9 @@ def _best_correlation(
     of_parent, of_child : (M,) and (N,) arrays
         Rates in consecutive windows; NaN if unknown.
     start_s : float
-        First stamp (s) of the parent minus that of the child.
+        First stamp of the parent minus first stamp of the child (s).
     step_s, window_s : float
-        Distance between the starts of windows, and length of a window.
+        Distance between the starts of two windows, and duration of a window (s).
     """
     lags, coefficients, overlaps, ratios = _masked_correlation(
         of_parent, of_child
@@ -216,8 +214,8 @@ def _best_correlation(
     is_possible = durations >= max(
         _MIN_OVERLAP_SHARE * shorter_s, _MIN_OVERLAP_S
     )
-    # Fisher's z of n samples has the standard deviation 1 / sqrt(n - 3). There is about one
-    # independent sample per second.
+    # Fisher's z for n samples has a standard deviation of 1 / sqrt(n - 3). About one sample per
+    # second is independent.
     fisher_z = np.arctanh(np.clip(coefficients, -1 + 1e-9, 1 - 1e-9))
     significance = fisher_z * np.sqrt(np.maximum(durations - 3, 0))
     significance[~is_possible] = -np.inf
@@ -225,7 +223,8 @@ def _best_correlation(
     lags_s = np.multiply(lags, step_s, dtype=float)
     peak_width_s = max(_PEAK_WIDTH_S, _PEAK_WIDTH_WINDOWS * window_s)
     rivals = significance[np.abs(lags_s - lags_s[best]) > peak_width_s]
-    # Vertex of the parabola through the best lag and its neighbours, in steps from the best lag.
+    # Vertex of the parabola through the best lag and its two neighbours, in steps from the best
+    # lag.
     below, top, above = coefficients[
         np.arange(best - 1, best + 2) % len(coefficients)
     ]
@@ -277,7 +276,8 @@ def angular_rates(
         )
         moved = se3.rotation_angle(rotations)
     rates = moved / window_s
-    # Number of long gaps before each pose. A window overlaps a gap if it differs at both ends.
+    # Number of long gaps before each pose. A window overlaps a gap if this number differs at its
+    # ends.
     gaps_before = np.r_[
         0, np.cumsum(np.diff(stamps_ns) > (max_gap_s + window_s) * 1e9)
     ]
@@ -293,8 +293,8 @@ def _masked_correlation(
     """Correlate rates (M,) and (N,) at all lags: ``first[i + lag]`` with ``second[i]``.
 
     NaNs are left out: D. Padfield, *Masked object registration in the Fourier domain*, IEEE
-    Transactions on Image Processing 21(5), 2012. The correlation is that of the square roots of the
-    rates, so that few large rates do not dominate.
+    Transactions on Image Processing 21(5), 2012. The square roots of the rates are correlated, so
+    that a few large rates do not dominate.
 
     Returns
     -------
@@ -302,7 +302,7 @@ def _masked_correlation(
     coefficients : (L,) array
         Correlation coefficients; 0 if a stream does not vary.
     counts : (L,) array
-        Numbers of common samples.
+        Numbers of samples that both streams have.
     ratios : (L,) array
         Ratios of the second rates to the first.
     """

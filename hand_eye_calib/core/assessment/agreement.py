@@ -32,14 +32,14 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.results.records import AXES
 
-# Variance (m^2, rad^2) of an unknown direction: so large that even many results together have no
-# information on the direction.
+# Variance (m^2, rad^2) of an unknown direction. It is so large that the direction remains unknown
+# in the mean of many results.
 _UNKNOWN_VARIANCE = 1e4
-# Gauss-Newton steps of the common extrinsic.
+# Number of Gauss-Newton steps for the common extrinsic.
 _ROUNDS = 2
 # Significance level: probability of a false alarm.
 _LEVEL = 0.01
-# Grid of the factors of the usual scatter. Results that scatter by more are not of one mount.
+# Grid of the factors of the usual scatter. Results with more scatter are not from one mount.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
 # Sentence by the kind of agreement.
@@ -62,8 +62,8 @@ class Agreement:
     kind : str
         "single", "agree", "differ", "scatter", "one off" or "moved".
     apart : tuple of int
-        Indices of the results that differ from the others: the result that is off, or all
-        results since the mount has moved.
+        Indices of the results that differ from the others: the single result that is off, or all
+        results after the mount has moved.
     T_parent_child : (4, 4) array
         Common extrinsic of the results that are not apart.
     covariance : (6, 6) array
@@ -72,15 +72,14 @@ class Agreement:
     scatter : (6,) array
         Estimated standard deviation of u_i along (m) and about (rad) the axes.
     chi2, dof, p_value : float, int, float
-        Chi-square test of the hypothesis that all results are of one extrinsic and scatter as
-        usual.
+        Chi-square test of the hypothesis that all results have one extrinsic and scatter as usual.
     excess : float
-        Ratio of the scatter without the results apart to the usual scatter.
+        Scatter of the results that are not apart, divided by the usual scatter.
     deviations : (N, 6) array
         Deviation of each result from the common extrinsic: x, y, z (m) along the parent's axes and
-        the rotation vector (rad) about them. NaN on unknown axes of the result.
+        the rotation vector (rad) about them. NaN on axes that are unknown in the result.
     sigmas : (N, 6) array
-        Standard deviations of each result, with the usual scatter.
+        Standard deviations of each result, including the usual scatter.
     """
 
     kind: str
@@ -96,7 +95,7 @@ class Agreement:
     sigmas: FloatArray
 
     def sentence(self, names: Sequence[str]) -> str:
-        """Describe the comparison of results with these names."""
+        """Describe the comparison in a sentence, with the names of the results."""
         sentence = _SENTENCES[self.kind].format(
             all=f"The {len(names)} recordings",
             both=listing(names),
@@ -110,7 +109,7 @@ class Agreement:
         return f"{sentence} ({numbers})"
 
     def _moves(self) -> str:
-        """List the axes on which the results apart differ by over two standard deviations.
+        """List the axes on which the results apart differ by more than two standard deviations.
 
         The axis that differs most is always listed.
         """
@@ -140,14 +139,14 @@ def agreement_of(
     Parameters
     ----------
     Ts_parent_child : (N, 4, 4) array
-        In the order of time.
+        Results in order of time.
     covariances : (N, 6, 6) array
-        Along and about the parent's axes.
+        Covariances along and about the parent's axes.
     usual : (6,) array, optional
-        Usual standard deviations of u_i along (m) and about (rad) the axes. By default there is no
-        scatter besides the covariances.
+        Usual standard deviations of u_i along (m) and about (rad) the axes. The default is no
+        scatter in addition to the covariances.
     level : float
-        Probability of reporting a difference between results of one extrinsic.
+        Probability that results of one extrinsic are reported as different.
     """
     usual_scatter = np.zeros(6) if usual is None else usual
     stated = np.array(
@@ -209,10 +208,10 @@ def _common(
     ----------
     Ts : (N, 4, 4) array
     covariances : (N, 6, 6) array
-        Without the scatter between recordings.
+        Covariances without the scatter between recordings.
     usual_scatter : (6,) array
     start : (4, 4) array
-        Linearisation point of the first step.
+        Point at which the first step linearises.
     """
     factors = np.ones((1, 2))
     if usual_scatter.any():
@@ -224,10 +223,10 @@ def _common(
     mean_covariances = np.linalg.inv(weights.sum(axis=1))
     _, log_determinants = np.linalg.slogdet(spread)
     _, log_determinants_of_mean = np.linalg.slogdet(mean_covariances)
-    # Restricted likelihood: the determinant of the mean's covariance is divided out.
+    # Restricted likelihood: divide by the determinant of the covariance of the mean.
     log_volumes = log_determinants.sum(axis=1) - log_determinants_of_mean
-    # Half-Cauchy density of each factor times the factor: a density over the factor's logarithm, in
-    # which the grid is uniform.
+    # The half-Cauchy density of a factor, times the factor, is a density over its logarithm. The
+    # grid is uniform in the logarithm.
     log_prior = np.log(factors / (1.0 + factors**2)).sum(axis=1)
     T = start
     for _ in range(_ROUNDS):
@@ -252,13 +251,13 @@ def _common(
 
 
 def unknown_directions(covariance: FloatArray) -> FloatArray:
-    """Return the orthonormal unknown directions (6, U) of a covariance (6, 6)."""
+    """Return orthonormal unknown directions (6, U) of a covariance (6, 6)."""
     values, vectors = np.linalg.eigh(covariance)
     return vectors[:, values > UNOBSERVABLE**2]
 
 
 def _without_unknown(covariance: FloatArray) -> FloatArray:
-    """Return a covariance (6, 6) with the variance of unknown directions set very large."""
+    """Return a covariance (6, 6) in which unknown directions have a very large variance."""
     if not np.isfinite(covariance).all():
         return _UNKNOWN_VARIANCE * np.eye(6)
     values, vectors = np.linalg.eigh(covariance)
@@ -268,7 +267,7 @@ def _without_unknown(covariance: FloatArray) -> FloatArray:
 
 
 class _Explanation(NamedTuple):
-    """Kind of agreement, mask (N,) of the results that differ, and the test of all results."""
+    """Kind of agreement, mask (N,) of the results that are apart, and the test of all results."""
 
     kind: str
     apart: BoolArray
@@ -291,7 +290,7 @@ def _explain(
     - "agree": no split is significant, and the chi-square test of all results accepts one
       extrinsic (_LEVEL).
     - "scatter": the test rejects one extrinsic for three or more results, and a scatter within the
-      grid of factors explains that.
+      grid of factors explains the result of the test.
     - "differ": the test rejects one extrinsic for two results, or no such scatter explains it.
 
     Parameters
@@ -322,7 +321,8 @@ def _explain(
     since = np.arange(2, n_results - 1)
     p_values = _p_values_of_splits(products, ranks, since)
     best = int(np.argmin(p_values))
-    # The best of several splits is tested (Bonferroni correction).
+    # The best of several splits is tested, so its p-value is multiplied by their number
+    # (Bonferroni).
     if len(p_values) * p_values[best] < level:
         if best < n_results:
             kind = "one off"
@@ -331,7 +331,7 @@ def _explain(
             kind = "moved"
             apart = number >= since[best - n_results]
     elif kind == "differ" and total_chi2 < _FACTORS[-1] ** 2 * total_dof:
-        # The usual scatter times at most the largest factor explains chi-square.
+        # A scatter of at most the largest factor times the usual scatter explains chi-square.
         kind = "scatter"
     return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
 
@@ -339,17 +339,18 @@ def _explain(
 def _p_values_of_splits(
     products: Blocks, ranks: Blocks, since: IntArray
 ) -> FloatArray:
-    """Return the p-values (N + S,) of splits of N results into two groups.
+    """Return the p-values (N + S,) of all splits of N results into two groups.
 
-    The p-value is the larger of two tests: the chi-square test of the reduction of chi-square, and
-    the F test of this reduction against the remaining chi-square.
+    A p-value is the larger one of two tests. The chi-square test is of the decrease of chi-square
+    by the split. The F test compares this decrease with the remaining chi-square.
 
     Parameters
     ----------
     products, ranks : Blocks
-        Of the results, as for :func:`_chi2_and_dof`.
+        Products and ranks of the results, as for :func:`_chi2_and_dof`.
     since : (S,) int array
-        First results of the second groups. The first N splits separate a single result.
+        First results of the second groups, for splits by time. The first N splits separate one
+        result each.
     """
     from scipy.special import chdtrc, fdtrc
 
@@ -380,7 +381,7 @@ def _p_values_of_splits(
 def _chi2_and_dof(
     products: FloatArray, ranks: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return chi-square and degrees of freedom of groups of errors about the mean of each group.
+    """Return chi-square and degrees of freedom of errors about the mean of their group.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Test by axis whether an extrinsic has moved.
 
 The difference d of two estimates has the covariance C. An axis k has moved if ``|d_k| / sigma_k``
-exceeds a limit. The largest of six normal variables exceeds this limit once in 200 comparisons. The
+exceeds a limit, which the largest of six normal variables exceeds once in 200 comparisons. The
 extrinsic has also moved if ``d' C^-1 d`` exceeds the 99.9 % quantile of chi-square with 6 degrees
-of freedom. An axis is the same only if the test would detect a change of the size that matters in
-nine of ten cases.
+of freedom. An axis is the same only if the test would detect a relevant change in nine of ten
+cases.
 """
 
 import math
@@ -20,14 +20,14 @@ from hand_eye_calib.core.base.text import amount, listing
 from hand_eye_calib.core.results.context import AxisDifference
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 
-# Standard deviations (m, rad) that represent "unknown".
+# Standard deviations (m, rad) of an unknown axis.
 UNKNOWN = np.sqrt(np.repeat([100.0, 10.0], 3))
-# Standard deviations (m, rad) above which an axis is unknown.
+# An axis with a larger standard deviation (m, rad) is unknown.
 UNKNOWN_FROM = 0.1 * UNKNOWN
 
 
 class Change(str, Enum):
-    """Verdict on a difference of two extrinsics."""
+    """Verdict on the difference between two extrinsics."""
 
     SAME = "same"
     MOVED = "moved"
@@ -44,14 +44,14 @@ class Change(str, Enum):
 
 @dataclass(frozen=True)
 class Moved:
-    """Difference of two estimates of an extrinsic.
+    """Difference between two estimates of an extrinsic.
 
     Attributes
     ----------
     axes : dict of str to AxisDifference
-        Along and about the axes of the parent sensor's frame.
+        Differences along and about the axes of the parent sensor's frame.
     verdict : Change
-        On all axes together.
+        Verdict on all axes together.
     """
 
     axes: dict[str, AxisDifference]
@@ -81,7 +81,7 @@ class Moved:
 
     @property
     def what(self) -> str:
-        """The axes that have moved; the two that differ most if none has moved on its own."""
+        """The axes that have moved. If no single axis has moved, the two that differ most."""
         axes = self._axes_that(Change.MOVED)
         if len(axes) > len(TRANSLATIONS):
             return f"{listing(axes)}, by {listing(self._totals())} in all"
@@ -108,7 +108,7 @@ class Moved:
         return sorted(different, key=lambda axis: -ratios[axis])[:2]
 
     def _totals(self) -> list[str]:
-        """Return the distance and the angle over all axes in words, with the largest sigmas."""
+        """Return the distance and the angle of the difference in words, with the largest sigmas."""
         totals = []
         for axes in (TRANSLATIONS, ROTATIONS):
             rows = [self.axes[axis] for axis in axes]
@@ -121,7 +121,7 @@ class Moved:
         return totals
 
     def _power(self, axes: Sequence[str]) -> str:
-        """Describe the changes of these axes that the test would detect."""
+        """Describe the changes that the test would detect on these axes."""
         changes = []
         for names in (AXES[:3], AXES[3:]):
             if tested := [axis for axis in names if axis in axes]:
@@ -133,19 +133,19 @@ class Moved:
 def moved(
     values: FloatArray, covariance: FloatArray, limits: FloatArray
 ) -> Moved:
-    """Test a difference of two estimates of an extrinsic.
+    """Test the difference between two estimates of an extrinsic.
 
     Parameters
     ----------
     values : (6,) array
         Difference along (m) and about (rad) the axes of the parent sensor's frame.
     covariance : (6, 6) array
-        Of the difference. It includes the scatter between recordings if the estimates come from two
-        recordings.
+        Covariance of the difference. If the estimates come from two recordings, it includes the
+        scatter between recordings.
     limits : (6,) array
-        Changes that the test must detect before an axis is called the same.
+        Changes that the test must be able to detect on an axis before the axis is called the same.
     """
-    # Keep the covariance of noise-free estimates invertible.
+    # Estimates without noise have a singular covariance. Make it invertible.
     covariance = covariance + 1e-18 * np.eye(6)
     sigmas = np.sqrt(np.diag(covariance))
     chi2 = float(values @ np.linalg.solve(covariance, values))

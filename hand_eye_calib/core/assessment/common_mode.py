@@ -1,11 +1,11 @@
 """Common-mode floor: the covariance of errors that are equal in every part of a recording.
 
-Such errors are wrong intrinsics of a camera, or a stretched lidar map. They change neither the
-residuals nor the difference between both halves of a recording. So the floor is not computed from
-the recording. It was measured on real recordings with a known extrinsic.
+Examples are wrong intrinsics of a camera, or a stretched lidar map. Such errors change neither the
+residuals nor the difference between both halves of a recording, so the floor cannot be computed
+from the recording. It was measured on real recordings with a known extrinsic.
 
-The floor is the C_floor of :mod:`hand_eye_calib.core.assessment.covariance`, and the allowance of
-the documentation (``docs/uncertainty.md``).
+The floor is C_floor in :mod:`hand_eye_calib.core.assessment.covariance`, and the allowance in the
+documentation (``docs/uncertainty.md``).
 """
 
 import numpy as np
@@ -17,27 +17,29 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import multiplied
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 
-# Standard deviation along each axis (m): error of the origin of an odometry's frame in its sensor.
-# Measured on real recordings with a known extrinsic.
+# Standard deviation (m) along each axis: the origin of an odometry's frame is not exactly in the
+# sensor. Measured on real recordings with a known extrinsic.
 FLOOR_TRANSLATION = 0.005
-# Standard deviation about each axis (rad), from the same recordings.
+# Standard deviation (rad) about each axis. Measured on the same recordings.
 FLOOR_ROTATION = float(np.radians(0.15))
-# Prior standard deviation of the scale of a path, if the model does not contain the scale.
+# Prior standard deviation of the scale of a path that is not part of the model.
 FLOOR_SCALE = 0.01
-# Standard deviation along each axis per speed (s): 0.25 % rotation error of an odometry, times the
-# distance of the observed scene, about two seconds of travel. Measured on ten rigs: the origin is
-# off by 6 to 14 cm on roads, equal to 5 to 15 ms of travel, and by 1 cm in rooms.
+# Standard deviation along each axis, divided by the speed (s). It is the rotation error of an
+# odometry, 0.25 %, times the distance of the scene, about two seconds of travel. Measured on ten
+# rigs: the origin is off by 6 to 14 cm on roads, which is 5 to 15 ms of travel, and by 1 cm in
+# rooms.
 FLOOR_TRAVEL_S = 0.005
 
-# Time (s) over which speeds are means: it averages the noise of neighbouring poses.
+# Duration (s) of the mean in a speed. It averages the noise of neighbouring poses.
 _SPEED_OVER_S = 1.0
 
-# Information below this share of the largest is noise: such directions are unknown anyway.
+# Directions with less information than this share of the largest are unknown: such information is
+# noise.
 _MIN_INFORMATION = 1e-6
 
 
 def common_mode_floor(speed_m_s: float = 0.0) -> FloatArray:
-    """Return the common-mode floor for a scale that is part of the model.
+    """Return the common-mode floor if the scale is part of the model.
 
     Parameters
     ----------
@@ -55,9 +57,9 @@ def common_mode_floor(speed_m_s: float = 0.0) -> FloatArray:
 
 
 def usual_speed(stamps_ns: IntArray, positions: FloatArray) -> float:
-    """Return the speed (m/s) above which half of the path is driven.
+    """Return the speed (m/s) that is exceeded on half of the path.
 
-    Neither stops nor jumps change this speed.
+    Stops and jumps do not change this speed.
 
     Parameters
     ----------
@@ -83,11 +85,11 @@ def open_scale_floor(by_scale: FloatArray, scale_variance: float) -> FloatArray:
     Parameters
     ----------
     by_scale : (6,) array
-        Derivative of the answer with respect to the logarithm of the scale of the child's path.
+        Derivative of the answer with respect to the log scale of the child's path.
     scale_variance : float
-        Variance of this scale, by the data alone.
+        Variance of this scale from the data alone.
     """
-    # The harmonic sum of the prior's and the data's variance.
+    # The inverse variances of the prior and of the data add up.
     open_variance = (
         FLOOR_SCALE**2 * scale_variance / (FLOOR_SCALE**2 + scale_variance)
     )
@@ -102,9 +104,8 @@ def floor_of_pairs(
 ) -> FloatArray:
     """Return the floor (6, 6) of an answer that minimises the squared residuals of motion pairs.
 
-    A scale s of the child's path changes the residual ``(R_A - I) t + t_A - s R t_B`` by
-    ``-R t_B ds``. Overlapping pairs repeat the same data, so the variance is multiplied by their
-    mean overlap.
+    A scale s of the child's path changes the residual ``(R_A - I) t + t_A - s R t_B`` by ``-R t_B
+    ds``. Overlapping pairs repeat the same data, so the variance is multiplied by the mean overlap.
 
     Parameters
     ----------

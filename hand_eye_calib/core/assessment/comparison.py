@@ -26,8 +26,7 @@ from hand_eye_calib.core.results.records import AXES, DofVerdict
 
 _Named = tuple[str, Calibration | Extrinsic]
 
-# Largest change, as a multiple of the target of an axis, that may stay undetected on an axis that
-# is reported as unchanged.
+# An axis that is reported as unchanged may have changed by at most this multiple of its target.
 SEEN_TARGETS = 5.0
 
 
@@ -38,22 +37,22 @@ def compare(
 ) -> Comparison:
     """Compare results with the installed extrinsic, or with each other.
 
-    A result whose parent and child are exchanged is inverted: it gets the frames of the first.
+    If the frames of a result are exchanged (child and parent), the result is inverted.
 
     Parameters
     ----------
     results : sequence of Calibration
     installed : Calibration or Extrinsic, optional
-        The extrinsic that the robot uses. Without it, the results of several recordings of one rig
-        are compared with each other.
+        Extrinsic that the robot uses. By default, the results of several recordings of one rig are
+        compared with each other.
     names : sequence of str, optional
-        Names of the results; numbered by default.
+        Names of the results; the default is a number.
 
     Returns
     -------
     Comparison
-        ``moved`` has the names of the results that differ from the installed extrinsic. Without
-        an installed extrinsic, it has the results without which the others agree.
+        ``moved`` has the names of the results that differ from the installed extrinsic. Without an
+        installed extrinsic, it has the results that the others contradict.
 
     Raises
     ------
@@ -91,7 +90,7 @@ def compare(
 
 
 def _in_frames_of(first: Calibration, result: Calibration) -> Calibration:
-    """Return a result, inverted if its parent and child are the child and parent of the first."""
+    """Return a result in given frames, inverted if they are exchanged."""
     is_exchanged = (
         result.parent_frame == first.child_frame
         and result.child_frame == first.parent_frame
@@ -150,7 +149,7 @@ def _comparison_with_each_other(
 def _differences(
     couples: Sequence[tuple[_Named, tuple[str, Calibration]]],
 ) -> tuple[Difference, ...]:
-    """Test whether the two extrinsics of each couple differ."""
+    """Test each pair of extrinsics for a difference."""
     if not couples:
         raise InputError(
             "expected two results or more, or one and the installed transform (--with, in Python "
@@ -168,7 +167,7 @@ def _verdict_of(differences: Sequence[Difference]) -> str:
 def _by_name(
     results: Sequence[Calibration], names: Sequence[str] | None
 ) -> dict[str, Calibration]:
-    """Return results by name: ``result 1``, ``result 2`` and so on if no names are provided."""
+    """Return results by name: the given names, or ``result 1``, ``result 2`` and so on."""
     if not names:
         names = [f"result {number}" for number in range(1, len(results) + 1)]
     by_name = dict(zip(names, results, strict=False))
@@ -185,7 +184,8 @@ def _moved_results(
 ) -> tuple[tuple[str, ...], str]:
     """Return the names of the results that the others contradict, and a sentence about them."""
     names = [*by_name]
-    # At least two results differ significantly. A weaker level is enough to find which one moved.
+    # At least two results differ significantly. A weaker level suffices to find which of them
+    # moved.
     agreement = agreement_of_results([*by_name.values()], level=0.05)
     if agreement.kind in ("one off", "moved"):
         moved_names = tuple(names[index] for index in agreement.apart)
@@ -204,7 +204,7 @@ def _moved_results(
 def with_comparison(
     result: Calibration, installed: Calibration | Extrinsic
 ) -> Calibration:
-    """Return a copy of a result that contains its comparison with the installed extrinsic."""
+    """Return a copy of a result with its comparison with the installed extrinsic."""
     origin = (
         "a result" if isinstance(installed, Calibration) else installed.origin
     )
@@ -222,7 +222,8 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     covariance, scatter, allowance = _covariances(before) + _covariances(after)
     if not (_is_from_motion(before) and _is_from_motion(after)):
         # Constant sensor errors cancel between two estimates from motion, but not here. The
-        # allowance covers them; on axes where the scatter is larger, the scatter is used instead.
+        # allowance covers them. Where the scatter between recordings is larger than the allowance,
+        # it is used instead.
         scatter = allowance + np.diag(
             np.maximum(np.diag(scatter - allowance), 0.0)
         )
@@ -245,7 +246,7 @@ def _is_from_motion(extrinsic: Calibration | Extrinsic) -> bool:
 
 
 def scatters_in_words(results: Sequence[Calibration]) -> str:
-    """Explain the scatter between recordings that the standard deviations of a comparison have."""
+    """Explain the scatter between recordings in the standard deviations of a comparison."""
     texts = [scatter_in_words(_covariances(result)[0]) for result in results]
     return (
         "+/- contains the usual scatter between recordings, which is assumed to be "
@@ -301,7 +302,7 @@ def agreement_of_results(
 
 
 def require_same_frames(results: Iterable[Calibration]) -> None:
-    """Raise InputError if results are for different pairs of frames."""
+    """Raise InputError if the results have different pairs of frames."""
     frames = {
         f"{result.child_frame} in {result.parent_frame}" for result in results
     }

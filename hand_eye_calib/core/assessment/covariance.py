@@ -5,20 +5,21 @@ micro Lie theory for state estimation in robotics*, 2018):
 
     X_true = X exp(xi),    cov(xi) = max(C_model, C_jackknife) + U U' + C_floor
 
-- C_model is the covariance under the noise model. The adaptive estimator computes its own C_model.
-  The other methods assume motion pairs with independent, equally large errors, and propagate these
-  errors to first order.
+- C_model is the covariance under the noise model. The adaptive estimator computes C_model itself.
+  For the other methods, C_model follows to first order from independent, equally large errors of
+  the motion pairs.
 - C_jackknife is the scatter of ten answers, each computed without one tenth of the recording
   (B. Efron, R. J. Tibshirani, *An introduction to the bootstrap*, 1993). It needs no noise model
   and includes time-correlated errors such as drift. The maximum is taken in each direction.
-- U are the directions that the motion does not reveal, times a standard deviation for "unknown".
+- U are the directions that the motion does not reveal, times the standard deviation of an unknown
+  direction.
 - C_floor is the common-mode floor: errors that are equal in every part of a recording, such as
   wrong intrinsics of a camera or a stretched lidar map. They change neither the residuals nor the
   difference between both halves of a recording.
 
-A rotation R displaces the end of a lever arm d by the chord (R - I) d. The mean square of the
-chord over K motions is d' S d with S = mean (R - I)'(R - I). If all rotations are about one axis,
-a lever arm along that axis is not displaced, and the translation along the axis stays unknown. The
+A rotation R displaces the end of a lever arm d by the chord (R - I) d. The mean square of this
+chord over K motions is d' S d, with S = mean (R - I)'(R - I). If all rotations are about one axis,
+a lever arm along this axis is not displaced, and the translation along the axis is unknown. The
 covariance, the stream checks and the hints to the driver all use this rule.
 """
 
@@ -40,47 +41,47 @@ from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.core.solvers.all_pairs import Solution
 
-# Number of blocks of the jackknife.
+# Number of blocks for the jackknife.
 BLOCKS = 10
-# Fewest blocks of a jackknife.
+# Without this number of blocks, no jackknife is computed.
 _LEAST_BLOCKS = 4
 # Fewest motion pairs or increments in a block.
 _LEAST_BLOCK_SIZE = 3
 
-# Smallest length of the part phi of a unit vector xi (rho, phi) that counts as a rotation.
+# A unit vector xi = (rho, phi) counts as a rotation if the length of phi exceeds this limit.
 _SHARE_OF_ROTATION = 0.5
 
-# Standard deviations (m, rad) that represent "unknown" in the covariance: the distance between
-# sensors on a large machine, and half a turn. An unknown direction is never exactly an axis of the
-# parent sensor, so a part of its variance is added to the other axes. Larger values would exceed
-# the variances of these other axes.
+# Standard deviations (m, rad) of an unknown direction: the distance between sensors on a large
+# machine, and half a turn. An unknown direction is never exactly an axis of the parent sensor, so a
+# part of its variance appears on the other axes. Larger values would hide the variances of these
+# other axes.
 UNKNOWN_SIGMAS = np.repeat([3.0, np.pi], 3)
 
-# Smallest divisor among variances (m^2 or rad^2): the variance of noise-free data is zero.
+# Smallest divisor among variances (m^2 or rad^2). The variance of noise-free data is zero.
 ROUNDING_VARIANCE = 1e-24
 
-# Information below this share of the largest is rounding.
+# Information below this share of the largest information is rounding.
 _RANK_TOLERANCE = 1e-12
 
-# The motion reveals a direction of the lever arm if the mean square displacement is this many times
-# the mean square displacement by rotation errors. Noise alone causes smaller ratios.
+# The motion reveals a direction of the lever arm if its mean square displacement exceeds that by
+# rotation errors by this factor. Noise alone causes smaller ratios.
 _MIN_SIGNAL_TO_NOISE = 3.0
 
-# The displacement along a direction must also be this share of the displacement along the direction
-# that moves most. With a smaller share, all rotation is about this direction to within 2.3 deg.
-# Systematic odometry errors of 1 or 2 % of the rotation are common and absent from the residuals.
+# The displacement along a direction must also exceed this share of the largest displacement. A
+# smaller share means that all rotation is about this direction to within 2.3 deg. Systematic
+# odometry errors of 1 or 2 % of the rotation are common, and absent from the residuals.
 _MIN_SHARE = 0.04
 
 # Smallest rotation error (rad): rounding of poses in files.
 _ROUNDING_ANGLE = 1e-6
 
-# An axis is hidden if more than this share of its squared length lies in hidden directions.
+# An axis is hidden if hidden directions contain more than this share of its squared length.
 _HIDDEN_SHARE = 0.1
 
-# Standard deviations (m, rad) above which an axis is weak.
+# An axis with a larger standard deviation (m, rad) is weak.
 WEAK = (0.05, float(np.radians(1.0)))
-# Standard deviation (m or rad) above which an axis or a direction is unobservable: its value has no
-# use.
+# An axis or a direction with a larger standard deviation (m or rad) is unobservable: its value is
+# useless.
 UNOBSERVABLE = 0.3
 
 
@@ -95,13 +96,13 @@ class Assessment:
         Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in the child sensor's frame,
         m and rad.
     observability : tuple of DofObservability
-        x, y, z, roll, pitch, yaw in the parent sensor's frame.
+        Verdicts on x, y, z, roll, pitch, yaw in the parent sensor's frame.
     contradictions : mapping
-        Axis name to the distance between prior and motion in standard deviations, for axes on which
-        prior and motion contradict each other. The prior of these axes is ignored.
+        Axes on which prior and motion contradict each other, with their distance in standard
+        deviations. The prior of these axes is ignored.
     from_motion : (6, 6) array
-        Derivative of the result with respect to the estimate from motion, both as xi. It is the
-        identity without a prior, and zero along directions that only a prior determines.
+        Derivative of the result with respect to the estimate from motion, both as xi. Without a
+        prior it is the identity. Along directions that only a prior determines it is zero.
     """
 
     T_parent_child: FloatArray
@@ -128,16 +129,16 @@ def assess(
     solution: Solution,
     solve_without: Callable[[BoolArray], FloatArray],
 ) -> Assessment:
-    """Assess the solution of K motion pairs.
+    """Assess the solution for K motion pairs.
 
     Parameters
     ----------
     pairs : MotionPairs
-        In order of time.
+        Motion pairs in order of time.
     solution : Solution
     solve_without : callable
-        Returns the answers (B, 4, 4) without the pairs in each row of a mask (B, K). The jackknife
-        uses it if there are enough pairs.
+        Function that returns the answers (B, 4, 4) without the pairs in each row of a mask (B, K).
+        If there are enough pairs, the jackknife calls it.
     """
     T_parent_child = solution.T_parent_child
     covariance, unknown = model_covariance(pairs, solution)
@@ -161,8 +162,8 @@ def assess_adaptive(
     )
     least_share = _MIN_SHARE
     if not solution.is_noise_dominated:
-        # Rotations exceed the noise of single poses. The solution then includes an estimate of the
-        # tilt of the axis, and half the share is enough.
+        # The rotations exceed the noise of single poses. The solution then estimates the tilt of
+        # the axis as well, so half of the share suffices.
         least_share = _MIN_SHARE / 2
     hidden = _hidden_by_noise(
         pose_pairs.Ts_pw_p,
@@ -180,8 +181,8 @@ def assess_rotation(
 ) -> Assessment:
     """Assess a solution of the adaptive estimator from rotations alone.
 
-    The translation is unknown. If the sensors rotate about only one axis, the rotation about this
-    axis is unknown, too. This axis is the hidden direction of a lever arm.
+    The translation is unknown. If the sensors rotate about a single axis, the rotation about this
+    axis is unknown as well; this axis is the hidden direction of a lever arm.
 
     Parameters
     ----------
@@ -217,7 +218,7 @@ def assess_lever_arm(
     covariance: FloatArray,
     of_faults: FloatArray,
 ) -> Assessment:
-    """Assess a lever arm in the frame of a sensor with poses.
+    """Assess a lever arm in the frame of a sensor that has poses.
 
     Parameters
     ----------
@@ -225,9 +226,9 @@ def assess_lever_arm(
         Poses of the sensor.
     solution : ModelSolution
     T : (4, 4) array
-        The lever arm with the identity for the rotation, which is unknown.
+        The lever arm, with an identity for the unknown rotation.
     covariance : (3, 3) array
-        Of the lever arm under the noise model.
+        Covariance of the lever arm under the noise model.
     of_faults : (3, 3) array
         Covariance that possible faults of the positions add.
     """
@@ -248,10 +249,10 @@ def assess_lever_arm(
 
 
 def _white_rotation_variance(rotations: FloatArray) -> float:
-    """Return an upper bound of the variance (rad^2) per axis of the white rotation noise.
+    """Return an upper bound of the variance (rad^2) per axis of white rotation noise.
 
-    The bound comes from the differences between steps about the two axes with the smoothest
-    rotation. The positions of a lever arm do not reveal this noise: it looks like a small motion
+    The bound is from the differences between successive steps about the two axes with the smoothest
+    rotation. The positions of a lever arm do not reveal this noise, which looks like a small motion
     that does not displace the lever arm.
 
     Parameters
@@ -261,7 +262,7 @@ def _white_rotation_variance(rotations: FloatArray) -> float:
     steps = se3.rotations_between(rotations[:-1], rotations[1:])
     squares = np.diff(steps, axis=0) ** 2
     median_squares = np.median(squares, axis=0)
-    # Differences of steps have six times the variance of white noise.
+    # The variance of a difference of steps is six times the variance of white noise.
     variances = median_squares / CHI2[0.5][1] / 6.0
     two_smallest = np.sort(variances)[:2]
     return float(two_smallest.mean())
@@ -270,15 +271,15 @@ def _white_rotation_variance(rotations: FloatArray) -> float:
 def widened_by_blocks(
     covariance: FloatArray, solution: ModelSolution, part: slice
 ) -> FloatArray:
-    """Widen the model's covariance of a part of xi to the scatter of blocks.
+    """Widen the model's covariance of a part of xi to the scatter between blocks.
 
-    All directions share one factor, the mean of their variance ratios: the ratio of a single
-    direction scatters too much. Rotations have a factor of their own if it is larger. The reason is
-    that the noise model may confuse slow rotation errors fixed to a sensor with errors fixed to a
-    world. Errors fixed to a world average out while the sensor moves, so the model's covariance is
-    then too small.
+    All directions share one factor, the mean of their variance ratios, because the ratio of a
+    single direction scatters too much. Rotations have their own factor if it is larger: the noise
+    model may confuse slow rotation errors fixed to a sensor with errors fixed to a world. Errors
+    fixed to a world average out while the sensor moves, so the model's covariance is too small in
+    this case.
 
-    A recording with too few increments for the blocks keeps the model's covariance.
+    If a recording has too few increments for the blocks, the model's covariance is unchanged.
     """
     if len(solution.jumps) < BLOCKS * _LEAST_BLOCK_SIZE:
         return covariance
@@ -295,7 +296,7 @@ def widened_by_blocks(
 
 
 def _mean_ratio(spread: FloatArray, covariance: FloatArray) -> float:
-    """Mean ratio of the variances of two covariances (n, n) over all directions."""
+    """Return the mean ratio of the variances of two covariances (n, n) over all directions."""
     information = np.linalg.pinv(covariance, hermitian=True)
     return float(np.trace(information @ spread) / len(covariance))
 
@@ -309,8 +310,8 @@ def _hidden_by_noise(
 ) -> FloatArray:
     """Return the directions (U, 3) of translation that the rotations do not reveal.
 
-    A single increment may be smaller than its noise, so sums of increments are tested, too. Long
-    baselines are best against white noise, short baselines against drift.
+    A single increment may be smaller than its noise. Therefore sums of increments are tested as
+    well. Long baselines are best against white noise, and short baselines against drift.
 
     Parameters
     ----------
@@ -332,7 +333,7 @@ def _hidden_by_noise(
         motions = se3.relative_rotations(
             rotations[:-baseline], rotations[baseline:]
         )
-        # Motions across a jump have weight zero, unless every motion is across a jump.
+        # Motions across a jump have weight zero, except if all motions are across a jump.
         is_without_jump = jumps_before[baseline:] == jumps_before[:-baseline]
         weights = is_without_jump.astype(float)
         if not is_without_jump.any():
@@ -346,14 +347,14 @@ def _hidden_by_noise(
 
 
 def _translations(directions: FloatArray) -> FloatArray:
-    """Return directions (U, 6) of xi = (rho, 0) from directions (U, 3) of rho."""
+    """Return directions (U, 6) of xi = (rho, 0) for directions (U, 3) of rho."""
     return np.pad(directions, ((0, 0), (0, 3)))
 
 
 def _larger(model: FloatArray, resampled: FloatArray) -> FloatArray:
     """Return the larger of two covariances (6, 6), direction by direction."""
-    # In coordinates where the model's covariance is the identity, the eigenvalues of the other are
-    # the ratios.
+    # In coordinates in which the model's covariance is the identity, the eigenvalues of the other
+    # covariance are the ratios of both variances.
     variances, axes = np.linalg.eigh(model)
     root = axes * np.sqrt(np.maximum(variances, ROUNDING_VARIANCE))
     whitened = np.linalg.solve(root, np.linalg.solve(root, resampled).T)
@@ -365,15 +366,15 @@ def _larger(model: FloatArray, resampled: FloatArray) -> FloatArray:
 def combined(
     T_parent_child: FloatArray, covariance: FloatArray, unknown: FloatArray
 ) -> Assessment:
-    """Assess a result from its covariance and the directions that the motion does not reveal.
+    """Assess a result, given its covariance and the directions that the motion does not reveal.
 
     Parameters
     ----------
     T_parent_child : (4, 4) array
     covariance : (6, 6) array
-        In the child's frame.
+        Covariance in the child's frame.
     unknown : (6, U) array
-        Orthonormal.
+        Orthonormal directions.
     """
     onto_known = np.eye(6) - unknown @ unknown.T
     scaled = UNKNOWN_SIGMAS[:, None] * unknown
@@ -388,9 +389,9 @@ def combined(
 
 
 def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
-    """Return an assessment in which these axes of the parent's frame are unobservable."""
-    # An axis that is unobservable already has an unknown direction near it. The axis itself as a
-    # second direction would make another axis unobservable.
+    """Return an assessment in which the given axes of the parent's frame are unobservable."""
+    # An unobservable axis already has an unknown direction near it. The axis as a second direction
+    # would make another axis unobservable.
     is_hidden = [
         dof.name in axes and dof.verdict is not DofVerdict.UNOBSERVABLE
         for dof in assessment.observability
@@ -403,7 +404,7 @@ def without_axes(assessment: Assessment, axes: Collection[str]) -> Assessment:
 
 def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
     """Return an assessment in which a lever arm along an axis (3,) of the parent is unknown."""
-    # The direction of an unobservable translation is this axis already. A second, slightly
+    # The unknown direction of an unobservable translation is already this axis. A second, slightly
     # different direction would make another axis unobservable.
     if any(
         dof.verdict is DofVerdict.UNOBSERVABLE
@@ -415,7 +416,7 @@ def without_direction(assessment: Assessment, axis: FloatArray) -> Assessment:
 
 
 def _without(assessment: Assessment, unknown: FloatArray) -> Assessment:
-    """Return an assessment in which directions (6, U) of the child are unknown, too."""
+    """Return an assessment in which further directions (6, U) of the child are unknown."""
     hidden = combined(
         assessment.T_parent_child, assessment.cov_parent_child_in_child, unknown
     )
@@ -431,7 +432,7 @@ def _without(assessment: Assessment, unknown: FloatArray) -> Assessment:
 def model_covariance(
     pairs: MotionPairs, solution: Solution
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (6, 6) for independent errors of the pairs, and the unknown directions.
+    """Return the covariance (6, 6) for independent errors of the pairs, and unknown directions.
 
     The cost is ``|r_t|^2 + 2 |r_R|^2`` with the residual translation r_t and the residual rotation
     vector r_R. Their Jacobians are J_t and J_R, the variances of the residuals s_t^2 and s_R^2. An
@@ -480,15 +481,15 @@ def model_covariance(
 def derivatives(
     pairs: MotionPairs, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the residuals of motion pairs.
+    """Derivatives of the residuals of motion pairs with respect to xi.
 
     Returns
     -------
     of_translation : (K, 3, 6) array
-        Derivatives with respect to xi = (rho, phi).
+        Derivatives of the translations with respect to xi = (rho, phi).
     of_rotation : (K, 3, 3) array
-        Derivatives with respect to phi, in axes that differ from pair to pair by a rotation. Such a
-        rotation does not change products J' J.
+        Derivatives of the rotations with respect to phi. Their axes differ from pair to pair by a
+        rotation, which does not change products J' J.
     """
     parent_chords = se3.rotation_of(pairs.Ts_parenti_parentj) - np.eye(3)
     child_chords = se3.rotation_of(pairs.Ts_childi_childj) - np.eye(3)
@@ -501,15 +502,15 @@ def derivatives(
 def lever_arm_products(
     chords: FloatArray, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Return S (3, 3), the weighted mean product of the chords of motions.
+    """Return S (3, 3), the weighted mean of the products of chords.
 
     Parameters
     ----------
     chords : (K, 3, 3) array
-        R - I of each motion. For lever arms in another frame: (R - I) Q, where Q rotates from that
+        R - I of each motion. For a lever arm in another frame: (R - I) Q, where Q rotates from this
         frame to the frame of R.
     weights : (K,) array, optional
-        1 by default.
+        Weights of the motions; 1 by default.
     """
     if weights is None:
         weights = np.ones(len(chords))
@@ -528,13 +529,12 @@ def _hidden_directions(
     Parameters
     ----------
     products : (3, 3) array
-        :func:`lever_arm_products` of the motions.
+        Products of the motions, see :func:`lever_arm_products`.
     cov_rotation : (3, 3) array
         Covariance C of the rotation errors, rad^2, in the frame of the lever arms. An error e
-        displaces a lever arm d by ``e x d``, with the mean square ``d' (tr(C) I - C) d``.
+        displaces a lever arm d by ``e x d``. The mean square is ``d' (tr(C) I - C) d``.
     least_share : float
-        Smallest displacement of a revealed direction, as a share of the displacement along the
-        direction that moves most.
+        Smallest displacement of a revealed direction, as a share of the largest displacement.
     """
     powers, directions = np.linalg.eigh(products)
     identity = np.eye(3)
@@ -551,12 +551,12 @@ def _hidden_directions(
 def hidden_axes(
     products: FloatArray, cov_rotation: FloatArray | None = None
 ) -> tuple[str, ...]:
-    """Return the names of the axes x, y, z that lie too far in hidden directions.
+    """Return the names of the axes x, y, z that lie mostly in hidden directions.
 
     Parameters
     ----------
     products : (3, 3) array
-        :func:`lever_arm_products` of the motions.
+        Products of the motions, see :func:`lever_arm_products`.
     cov_rotation : (3, 3) array, optional
         Covariance of the rotation errors, rad^2; zero by default.
     """
@@ -570,7 +570,7 @@ def hidden_axes(
 
 
 def basis(directions: list[FloatArray]) -> FloatArray:
-    """Return an orthonormal basis (6, U) of directions (6,), which may be linearly dependent."""
+    """Return an orthonormal basis (6, U) of directions (6,) that may be linearly dependent."""
     if not directions:
         return np.zeros((6, 0))
     vectors, sizes, _ = np.linalg.svd(
@@ -580,7 +580,7 @@ def basis(directions: list[FloatArray]) -> FloatArray:
 
 
 def judged(axis: str, sigma: float) -> DofObservability:
-    """Judge an axis by its standard deviation (m or rad): observed, weak or unobservable."""
+    """Return the verdict on a standard deviation (m or rad): observed, weak or unobservable."""
     if sigma > UNOBSERVABLE:
         return DofObservability(axis, DofVerdict.UNOBSERVABLE, float("inf"))
     is_weak = sigma > WEAK[axis in ROTATIONS]

@@ -1,4 +1,4 @@
-"""Motion of the parent sensor so far, and hints on the motion that is missing."""
+"""Motion of the parent sensor during a session, and hints about motion that is missing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -17,28 +17,28 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 
-# Largest number of poses that are used, evenly spaced over the session. They resolve every curve
-# and take some milliseconds.
+# Largest number of poses that are used, evenly spaced over the session. They resolve every curve,
+# and the computation takes some milliseconds.
 _MAX_POSES = 500
 
-# Quantile of the rotations about an axis that represents them. It excludes outliers.
+# The rotation about an axis is represented by this quantile, which excludes outliers.
 _QUANTILE = 0.95
 
-# Smallest rotation (rad) that reveals a lever arm.
+# A smaller rotation (rad) does not reveal a lever arm.
 MIN_ROTATION = float(np.radians(5.0))
 
-# Speed over a second (m/s) above which a sensor moves.
+# A sensor moves if its mean speed over a second (m/s) exceeds this limit.
 _MOVES_M_S = 0.05
-# Angular rate over a second (rad/s) above which a sensor moves.
+# A sensor also moves if its mean angular rate over a second (rad/s) exceeds this limit.
 _MOVES_RAD_S = float(np.radians(1.0))
-# Time between the poses of a speed, ns.
+# Time (ns) between the two poses from which a speed is computed.
 _STEP_NS = 1_000_000_000
 
-# Smallest mean squared cosine between the steps and one axis of the sensor if wheels or tracks move
-# it; also the smallest cosine between x and a motion along x. Measured: road vehicles 0.95 to 1;
-# handheld devices, drones and robot arms 0.4 to 0.85.
+# Wheels or tracks move a sensor if the mean squared cosine between its steps and one of its axes is
+# at least this. A motion is along x if its cosine with x is at least this. Measured: 0.95 to 1 for
+# road vehicles; 0.4 to 0.85 for handheld devices, drones and robot arms.
 _ALONG_ONE_AXIS = 0.9
-# Steps below this share of the median length are noise and have no direction.
+# A step below this share of the median length is noise, without a direction.
 _LONG_STEP = 0.3
 # Manoeuvres that turn a vehicle about its x, y and z.
 _MANOEUVRES = (
@@ -47,9 +47,9 @@ _MANOEUVRES = (
     "drive curves to both sides",
 )
 
-# Advice about the height of a vehicle that has only turned about its vertical axis, and what a
-# recording, but no live session, may contain in addition.
+# Advice about the height of a vehicle that has turned about its vertical axis only.
 _ON_A_FLAT_FLOOR = "drive over a ramp or a kerb, or measure it by hand"
+# Addition for recordings. A live session has no clouds.
 _WITH_LIDARS = ", or, if both sensors are lidars, record their clouds and run calibrate on the bag"
 
 
@@ -60,20 +60,20 @@ class Excitation:
     Attributes
     ----------
     n_poses : int
-        Synchronised pose pairs of the session.
+        Number of synchronised pose pairs of the session.
     rotation : (3,) array
-        Rotation about x, y and z between two poses, rad. The poses are as far apart as gives the
-        largest rotation; the value is the 95th percentile over the session.
+        Rotation about x, y and z between two poses, rad: the 95th percentile over the session. The
+        distance between the poses is the one with the largest rotation.
     lever_arms : (3, 3) array
         :func:`~hand_eye_calib.core.assessment.covariance.lever_arm_products` of the rotations
-        between two poses. The poses are as far apart as gives the largest displacement.
+        between two poses. The distance between the poses is the one with the largest displacement.
     distance : float
-        Length of the path, m.
+        Length of the path of the sensor, m.
     motion_s : float
-        Seconds during which the sensor moved. A robot at rest reveals nothing.
+        Time (s) during which the sensor moved.
     drives : bool
-        Whether the sensor moves along one of its own axes, as on a vehicle. True before the first
-        motion.
+        Whether the sensor moves along one of its own axes, like a sensor on a vehicle. True before
+        the first motion.
     forward : (3,) array
         Unit vector of the main direction of motion; 0 if the sensor has not moved.
     """
@@ -96,7 +96,7 @@ class Excitation:
         return bool(self.drives and turns_about_z and moves_along_x)
 
     def hidden_axes(self) -> tuple[str, ...]:
-        """Return the axes x, y, z along which even noise-free motion hides the translation."""
+        """Return the axes x, y, z whose translation even noise-free motion does not reveal."""
         if self.rotation.max() < MIN_ROTATION:
             return TRANSLATIONS
         return hidden_axes(self.lever_arms)
@@ -141,18 +141,19 @@ def excitation(pose_pairs: PosePairs) -> Excitation:
 
 
 def _main_direction(poses: FloatArray, lag: int) -> tuple[float, FloatArray]:
-    """Return the mean squared cosine to the main direction of motion, and this direction.
+    """Return the mean squared cosine between motion and main direction, and this direction.
 
     Parameters
     ----------
     poses : (N, 4, 4) array
     lag : int
-        Number of poses of a step.
+        Number of poses in a step.
 
     Returns
     -------
     share : float
-        From 1/3 for motion in all directions of the sensor to 1 for motion along one axis.
+        Mean squared cosine: 1/3 for motion in all directions of the sensor, 1 for motion along one
+        axis.
     axis : (3,) array
         Unit vector in the sensor's frame; 0 without motion.
     """
@@ -168,7 +169,7 @@ def _main_direction(poses: FloatArray, lag: int) -> tuple[float, FloatArray]:
 
 
 def seconds_of_motion(pose_pairs: PosePairs) -> float:
-    """Return the seconds during which the parent sensor moved, by poses a second apart."""
+    """Return the time (s) during which the parent sensor moved, from poses one second apart."""
     stamps_ns = pose_pairs.stamps_ns
     seconds = (stamps_ns - stamps_ns[0]) // _STEP_NS
     _, first_rows = np.unique(seconds, return_index=True)
@@ -188,14 +189,14 @@ def seconds_of_motion(pose_pairs: PosePairs) -> float:
 def what_is_missing(
     seen: Excitation, calibration: Calibration | None = None
 ) -> str:
-    """Describe what the motion so far does not determine, and the motion that would.
+    """Describe what the motion so far does not determine, and which motion determines it.
 
     Parameters
     ----------
     seen : Excitation
-        Motion of the parent sensor; x, y, z are its axes.
+        Motion of the parent sensor. The axes x, y, z are those of this sensor.
     calibration : Calibration, optional
-        The result from the same poses. If present, its verdicts decide instead of the motion.
+        Result from the same poses. If present, its verdicts decide instead of the motion.
 
     Returns
     -------
@@ -217,10 +218,10 @@ def what_is_missing(
 
 
 def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
-    """Describe the motion that reveals most about these axes.
+    """Describe the motion that reveals most about the given axes.
 
-    A rotation about one axis reveals offsets along the other two axes and angles about them, but
-    nothing along or about its own axis.
+    A rotation about an axis reveals offsets along the other two axes, and angles about them. It
+    reveals nothing along or about its own axis.
 
     Parameters
     ----------
@@ -241,7 +242,7 @@ def helpful_motion(axes: Sequence[str], seen: Excitation) -> str:
 def axes_by_hand(axes: Sequence[str], seen: Excitation) -> tuple[str, ...]:
     """Return the axes for which :func:`helpful_motion` proposes a measurement by hand.
 
-    All rotation so far is about such an axis, so this rotation hides the offset along it.
+    All rotation so far is about such an axis, which hides the offset along it.
 
     Parameters
     ----------
@@ -257,7 +258,7 @@ def axes_by_hand(axes: Sequence[str], seen: Excitation) -> tuple[str, ...]:
 
 
 def _turns_about_one_axis(seen: Excitation) -> bool:
-    """Whether the motion has rotation about exactly one axis."""
+    """Return whether the motion has rotation about exactly one axis."""
     return int((seen.rotation < MIN_ROTATION).sum()) == 2
 
 
@@ -293,7 +294,7 @@ def _motion_for(name: str, seen: Excitation) -> int | str:
 def _motion_for_only_axis(
     name: str, others: Sequence[int], seen: Excitation
 ) -> str:
-    """Describe the motion that reveals the only axis that all rotation so far is about.
+    """Describe the motion that reveals most about the axis of all rotation so far.
 
     ``others`` are the indices of the other two axes.
     """

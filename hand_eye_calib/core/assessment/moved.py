@@ -12,14 +12,13 @@ scatters more than H predicts. The ratio tests many possible times of a shift.
 :mod:`~hand_eye_calib.core.assessment.change` tests single axes, to report which axis has moved.
 
 A motion pair within a recording has the residual ``e = Log(B^-1 X0^-1 A X0)`` (6,) at an extrinsic
-X0. If the mount has moved by xi, to ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I -
-Ad(B^-1)``. With the noise covariance C each second has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1
-e``; H and S are sums over time. Large residuals have less weight, so a shift is underestimated: a
-small one by a known share, a large one by more. Then compute H and S again at the shifted
-extrinsic.
+X0. If the mount moves to ``X0 exp(xi)``, then ``e = -J xi + noise`` with ``J = I - Ad(B^-1)``. For
+the noise covariance C, a second of motion has ``H = sum J' C^-1 J`` and ``S = -sum J' C^-1 e``;
+longer times have the sums. Large residuals get less weight. This reduces a small shift by a known
+share, and a large shift by more. Therefore H and S are computed again at the shifted extrinsic.
 
-Successive motions have correlated noise, which the long-run variance measures. Errors that drift
-over minutes, such as a bias or a bent map, also cause a large ratio. The stream checks therefore
+The noise of successive motions is correlated, and the long-run variance measures this. Errors that
+drift over minutes, such as a bias or a bent map, also cause a large ratio; so the stream checks
 test whether a moving world explains the motion as well. Results of one rig scatter between
 recordings by more than their covariances, because constant errors cannot be detected within a
 recording. C must include this scatter (docs/session.md has the measurements).
@@ -48,32 +47,33 @@ from hand_eye_calib.core.pairing.motion_pairs import (
     pairs_over,
 )
 
-# Prior standard deviation of a shift, per axis of translation (m) and of rotation (rad).
+# Prior standard deviation of a shift along each axis (m).
 _SHIFT_M = 0.03
+# Prior standard deviation of a shift about each axis (rad).
 _SHIFT_RAD = float(np.radians(1.0))
 
-# Standard deviation between the results of several recordings of one rig, per axis (m, rad).
-# Measured on flights and hand-held recordings.
+# Standard deviation between the results of several recordings of one hand-held rig or aircraft,
+# along (m) and about (rad) each axis. Measured.
 _SCATTER_IN_HAND = np.repeat([0.008, np.radians(0.12)], 3)
-# The same standard deviation, measured on vehicles.
+# The same standard deviation for vehicles. Measured.
 _SCATTER_OF_VEHICLES = np.repeat([0.020, np.radians(0.10)], 3)
-# A rig counts as a vehicle if the standard deviation of the translation along one axis is larger
-# than along the other two by this factor: a vehicle turns about this axis only.
+# A rig counts as a vehicle if the standard deviation of its translation along one axis exceeds that
+# along the other two axes by this factor: a vehicle turns about this axis only.
 _VEHICLE_SIGMA_RATIO = 4.0
 
-# Duration of a motion pair, and of the blocks of time in which H and S are summed (ns).
+# Duration (ns) of a motion pair, and of the blocks of time over which H and S are summed.
 _BLOCK_NS = 1_000_000_000
 # Largest number of motion pairs per block, on average over the recording.
 _MAX_PAIRS_PER_BLOCK = 20
 
-# Iterations of the noise covariance.
+# Number of iterations in the estimate of the noise covariance.
 _NOISE_ITERATIONS = 4
 # Smallest standard deviations of residuals (m, rad).
 _MIN_SIGMAS = np.repeat([1e-6, 1e-7], 3)
 
-# Number of windows of equal duration in a recording for the long-run variance.
+# Numbers of equal windows into which a recording is divided for the long-run variance.
 _WINDOW_COUNTS = (8, 16)
-# Fewest windows before a possible shift, and fewest after it.
+# Fewest windows on each side of a possible shift.
 _MIN_WINDOWS_PER_SIDE = 2
 # Shortest window (s).
 _MIN_WINDOW_S = 3.0
@@ -81,15 +81,15 @@ _MIN_WINDOW_S = 3.0
 # Smallest log likelihood ratio of a significant shift.
 SIGNIFICANT = 12.0
 
-# Prior probability that a mount moves within a recording.
+# Prior probability that a mount moves during a recording.
 _PRIOR_PROBABILITY = 0.02
-# Fewest parts of a recording before a possible shift, and fewest after it.
+# Fewest parts of a recording on each side of a possible shift.
 _MIN_PARTS_PER_SIDE = 4
-# A shift with a smaller probability is ignored.
+# A shift with a smaller posterior probability is ignored.
 _MIN_PROBABILITY = 1e-3
 
 # Weight of the prior of a shift within a recording, as a share of SHIFT_INFORMATION. It only keeps
-# the estimate finite: without it, shifts of many metres are possible along unobservable directions.
+# the estimate finite: otherwise, shifts of many metres are possible along unobservable directions.
 _PRIOR_SHARE = 1e-6
 
 
@@ -105,7 +105,7 @@ def scatter_of_recordings(covariance: FloatArray) -> FloatArray:
 
 
 def counts_as_vehicle(covariance: FloatArray) -> bool:
-    """Whether one translation is much less certain than the others, by a covariance (6, 6)."""
+    """Return whether one translation is much less certain than the others, by a covariance."""
     variances = np.linalg.eigvalsh(covariance[:3, :3])
     return bool(variances[2] > _VEHICLE_SIGMA_RATIO**2 * variances[1])
 
@@ -135,7 +135,7 @@ SHIFT_INFORMATION = inverse(_EXPECTED_SHIFTS)
 def log_ratio(
     tables: FloatArray, L: FloatArray = _EXPECTED_SHIFTS
 ) -> FloatArray:
-    """Return the log likelihood ratio (...) of a shift against none.
+    """Return the log likelihood ratio (...) of a shift against no shift.
 
     Parameters
     ----------
@@ -153,14 +153,14 @@ def log_ratio(
 
 def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
-    # NumPy 1 reads S as vectors, not as columns, if H and S differ in their number of dimensions.
+    # If S has fewer dimensions than H, NumPy 1 reads S as a stack of vectors instead of columns.
     columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[
         ..., None
     ]
     try:
         solved = np.linalg.solve(H, columns)
     except np.linalg.LinAlgError:
-        # Exact poses determine some directions so well that H is singular within rounding errors.
+        # Exact poses determine some directions so well that rounding makes H singular.
         solved = np.linalg.pinv(H) @ columns
     return np.asarray(solved[..., 0])
 
@@ -202,11 +202,11 @@ class MountChange:
         Stamp of the shift on the parent's clock.
     xi : (6,) array
         The shift (rho, phi) in the child sensor's frame, m and rad: the extrinsic is ``X`` before
-        and ``X exp(xi)`` afterwards.
+        and ``X exp(xi)`` after the shift.
     covariance : (6, 6) array
         Covariance of xi, multiplied by the long-run variance.
     log_ratio : float
-        Log likelihood ratio of this shift against none.
+        Log likelihood ratio of this shift against no shift.
     """
 
     at_ns: int
@@ -220,8 +220,8 @@ def residuals_and_jacobians(
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals e (K, 6) of motion pairs at an extrinsic X0, and J (K, 6, 6).
 
-    If the mount has moved to ``X0 exp(xi)``, then ``e = -J xi + noise``. So J is the derivative of
-    e with respect to X0, and the negative derivative with respect to the true extrinsic.
+    If the mount moves to ``X0 exp(xi)``, then ``e = -J xi + noise``. So J is the derivative of e
+    with respect to X0, and the negative derivative with respect to the true extrinsic.
     """
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
     Bs_predicted = (
@@ -261,7 +261,7 @@ def evidence(
 def noise_covariance(residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Estimate the covariance (6, 6) of residuals (K, 6), with noise of Student's t distribution.
 
-    The second result are the robust weights (K,) of the residuals: 1 on average, small for jumps.
+    The second result has the robust weights (K,) of the residuals: 1 on average, small for jumps.
     """
     sigmas = np.repeat(
         [stats.robust_sigma(part) for part in np.split(residuals, 2, axis=1)], 3
@@ -307,7 +307,7 @@ def find_change(
     ratios[len(ratios) - n_edge + 1 :] = -np.inf
     best = int(np.argmax(ratios))
     damped = information(shifts[best]) + _PRIOR_SHARE * SHIFT_INFORMATION
-    # The weights belong to the extrinsic X0, so the estimate is only a share of the shift.
+    # The weights were computed at X0. They reduce the estimate to a share of the shift.
     share = stats.share_of_step(6)
     return MountChange(
         at_ns=int(starts_ns[best + 1]),
@@ -336,10 +336,10 @@ def shifts_at(blocks: Blocks, cuts: IntArray) -> FloatArray | None:
 
 
 def _worst_long_run_variance(blocks: Blocks) -> float | None:
-    """Return the largest ratio of long-run variance to the variance of independent scores.
+    """Return the largest long-run variance of the scores, relative to independent scores.
 
-    The ratio is at least 1. ``blocks`` has ``[H S]`` of each second. Returns None if there are too
-    few seconds.
+    The ratio is at least 1. ``blocks`` has ``[H S]`` of each second. None if there are too few
+    seconds.
     """
     counts = [
         count
@@ -356,9 +356,9 @@ def _worst_long_run_variance(blocks: Blocks) -> float | None:
 def _long_run_variance(windows: Blocks) -> float:
     """Return the variance of the scores of windows, divided by the variance that H predicts.
 
-    A shift must not increase this variance. So each possible time of a shift has two estimates,
-    one before and one after it, and scores are relative to the estimate of their side. The smallest
-    variance over all times is returned.
+    A shift must not increase this variance. Therefore each possible time of a shift has two
+    estimates, before and after it, and the scores on each side are relative to the estimate of that
+    side. The result is the smallest variance over all times.
     """
     n_windows = len(windows.sums)
     cuts = np.arange(
@@ -367,7 +367,7 @@ def _long_run_variance(windows: Blocks) -> float:
     sides = np.stack([windows.before(cuts), windows.since(cuts)], axis=1)
     estimates = most_likely(sides, _PRIOR_SHARE)
     side_of_window = (np.arange(n_windows) >= cuts[:, None]).astype(int)
-    # Estimate of the side of each window, for each cut.
+    # For each cut, the estimate on the side of each window.
     row_of_cut = np.arange(len(cuts))[:, None]
     answers = estimates[row_of_cut, side_of_window]
     traces = np.trace(information(windows.sums), axis1=1, axis2=2)
@@ -375,7 +375,7 @@ def _long_run_variance(windows: Blocks) -> float:
     squares = squares_about(
         windows.sums[has_evidence], answers[:, has_evidence], _PRIOR_SHARE
     )
-    # Each window has six values; the two estimates use up twelve.
+    # Each window has six values. The two estimates use twelve degrees of freedom.
     dof = max(6 * int(has_evidence.sum()) - 12, 1)
     return float(squares.sum(axis=1).min()) / dof
 
@@ -411,9 +411,9 @@ def possible_shift(
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Return the covariance that a possible shift of the mount adds, and a warning.
 
-    The estimates before and after each possible time are compared under the noise model. The
-    likelihood ratio of a shift, averaged over these times, leads to the probability of a shift. A
-    result between both mounts is half of the shift away from either mount.
+    Under the noise model, the estimates before and after each possible time are compared. The
+    likelihood ratio, averaged over these times, leads to the probability of a shift. A result in
+    the middle between both mounts is wrong by half of the shift.
 
     Parameters
     ----------
@@ -429,8 +429,8 @@ def possible_shift(
     covariance : (6, 6) array
         Covariance of xi in ``X exp(xi)``, in m and rad; zero if a shift is improbable.
     warnings : tuple of str
-        One warning if a shift is more likely than not, even after the scatter between recordings is
-        added to the covariances; else empty.
+        One warning if a shift is more likely than no shift, even with the scatter between
+        recordings in the covariances; otherwise empty.
     """
     cuts = np.arange(
         _MIN_PARTS_PER_SIDE, len(products) - _MIN_PARTS_PER_SIDE + 1

@@ -1,14 +1,14 @@
-"""Fusion of the estimate from motion with a prior.
+"""Combination of the estimate from motion with a prior.
 
 The estimate from motion X0 has the covariance C. The residuals r(X) of the prior are divided by its
 standard deviations. The result X minimises, by Gauss-Newton steps ``X <- X exp(step)``,
 
     d(X)' C^-1 d(X) + r(X)' r(X),
 
-where d(X) is the deviation (rho, phi) of X from X0 in the child's frame. Only the prior determines
-a direction that the motion does not reveal. Without a prior, the direction stays unknown, and the
-translation along it is set to zero, because the estimate is only noise. Reference: T. Barfoot,
-*State estimation for robotics*, 2017.
+Here d(X) is the deviation (rho, phi) of X from X0 in the child's frame. A direction that the motion
+does not reveal is determined by the prior only. Without a prior the direction is unknown; the
+translation along it is set to zero, because its estimate is noise. Reference: T. Barfoot, *State
+estimation for robotics*, 2017.
 """
 
 from collections.abc import Mapping
@@ -32,28 +32,29 @@ from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 # Axis name to (value, standard deviation), in m and rad.
 Prior: TypeAlias = Mapping[str, tuple[float, float]]
 
-# A direction is unknown if its variance exceeds this share of the variance for "unknown".
+# A direction is unknown if its variance exceeds this share of the variance in UNKNOWN_SIGMAS.
 _UNKNOWN_SHARE = 0.25
 
 # Largest number of Gauss-Newton steps.
 _MAX_STEPS = 20
-# The iteration ends below this step (m, rad).
+# The iteration ends if the step (m, rad) is shorter than this.
 _STEP_TOLERANCE = 1e-12
 
-# Step of numerical derivatives (m or rad), and smallest standard deviation of a prior: a smaller
-# one makes the equations singular.
+# Step (m or rad) of numerical derivatives. Also the smallest standard deviation of a prior: a
+# smaller value would make the equations singular.
 _SMALL = 1e-6
 
-# A prior contradicts the estimate from motion above this many standard deviations.
+# Prior and estimate from motion contradict each other if they differ by more than this number of
+# standard deviations.
 _MAX_DISTANCE = 4.0
 
-# Largest lever arm (m) of any machine: a longer prior is in another unit. This limit replaces the
-# distance above on unobservable axes, where the motion cannot contradict a prior.
+# Longest lever arm (m) of any machine: a longer prior has another unit. On unobservable axes the
+# motion cannot contradict a prior, so this limit is used there.
 _MAX_LEVER_ARM = 50.0
 
 
 def fuse(assessment: Assessment, prior: Prior) -> Assessment:
-    """Fuse the estimate from motion with a prior, and set directions that neither determines.
+    """Combine the estimate from motion with a prior, and set directions that neither determines.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def fuse(assessment: Assessment, prior: Prior) -> Assessment:
     for axis, sigma, is_halved in zip(
         AXES, sigmas.tolist(), are_halved, strict=True
     ):
-        # The value of an axis is mostly the prior's if the prior at least halves its variance.
+        # An axis gets its value from the prior if the prior at least halves its variance.
         is_from_prior = axis in prior and bool(is_halved)
         verdicts.append(_verdict_on(axis, sigma, is_from_prior))
     from_motion = whitening.root @ whitened_covariance @ whitening.inverse_root
@@ -108,12 +109,12 @@ class _Whitening(NamedTuple):
     Attributes
     ----------
     root : (6, 6) array
-        From coordinates of unit variance to deviations (rho, phi).
+        Matrix from coordinates of unit variance to deviations (rho, phi).
     inverse_root : (6, 6) array
-        From deviations to coordinates of unit variance.
+        Matrix from deviations to coordinates of unit variance.
     targets : (6,) array
-        Deviation, in these coordinates, of the result without a prior. It is zero along known
-        directions. Along unknown directions, it makes the translation of X zero.
+        Deviation of the result without a prior, in these coordinates. It is zero along known
+        directions. Along unknown directions it makes the translation of X zero.
     """
 
     root: FloatArray
@@ -124,9 +125,9 @@ class _Whitening(NamedTuple):
 def _minimum(
     start: FloatArray, whitening: _Whitening, prior: Prior
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the minimum (4, 4) of the cost, and the normal matrix (6, 6) there.
+    """Return the transform (4, 4) with the smallest cost, and the normal matrix (6, 6) there.
 
-    The normal matrix is in coordinates of unit variance.
+    The normal matrix is in the coordinates of unit variance.
     """
     root = whitening.root
     back = se3.rotation_of(start).T
@@ -150,7 +151,7 @@ def _minimum(
 def _verdict_on(
     axis: str, sigma: float, is_from_prior: bool
 ) -> DofObservability:
-    """Return the verdict on an axis by its standard deviation and the origin of its value."""
+    """Return the verdict on an axis by its standard deviation and the source of its value."""
     verdict = judged(axis, sigma)
     is_observable = verdict.verdict is not DofVerdict.UNOBSERVABLE
     if is_observable and is_from_prior:
@@ -159,7 +160,7 @@ def _verdict_on(
 
 
 def halves_variance(sigmas: FloatArray, motion_sigmas: FloatArray) -> BoolArray:
-    """Return a mask (6,) of the axes whose variance is at most half of the variance by motion."""
+    """Return a mask (6,) of the axes whose variance is at most half of that by motion alone."""
     return 2 * sigmas**2 < motion_sigmas**2
 
 
@@ -185,8 +186,8 @@ def _whitened(
 ) -> _Whitening:
     """Return coordinates in which deviations from the estimate have unit variance.
 
-    The variances of known and unknown directions differ by many powers of ten, so known and unknown
-    directions are whitened separately.
+    The variances of known and unknown directions differ by many powers of ten. Therefore both are
+    whitened separately.
     """
     values, vectors = np.linalg.eigh(unknown @ unknown.T)
     known_directions = vectors[:, values < 0.5]
@@ -234,14 +235,14 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
     angles = {axis: prior[axis][0] for axis in ROTATIONS if axis in prior}
     rotation = se3.rotation_of(T)
     if len(angles) == 3:
-        # The rotation vector from the prior to T has no gimbal lock.
+        # The rotation vector from the prior to T is defined in gimbal lock, too.
         nominal = se3.rotation_from_rpy(list(angles.values()))
         rotation_vector = se3.rotation_log(rotation @ nominal.T)
         errors |= dict(zip(ROTATIONS, rotation_vector, strict=True))
     elif angles:
         rpy = dict(zip(ROTATIONS, se3.rotation_to_rpy(rotation), strict=True))
         for axis, angle in angles.items():
-            # The phase of a complex number is between -pi and pi.
+            # np.angle returns a value between -pi and pi.
             errors[axis] = np.angle(np.exp(1j * (rpy[axis] - angle)))
     return np.array(
         [
@@ -254,7 +255,8 @@ def _weighted(T: FloatArray, prior: Prior) -> FloatArray:
 def _contradictions(assessment: Assessment, prior: Prior) -> dict[str, float]:
     """Return the axes whose prior contradicts the motion.
 
-    The values are the distances between prior and motion, in standard deviations of both together.
+    The values are the distances between prior and motion, divided by their joint standard
+    deviation.
     """
     residuals, jacobian = _prior_residuals(assessment.T_parent_child, prior)
     covariance = assessment.cov_parent_child_in_child

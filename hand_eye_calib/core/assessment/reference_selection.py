@@ -14,15 +14,15 @@ from hand_eye_calib.core.solvers.registry import Method
 # References that are compared.
 _CANDIDATES = ("B1", "B2", "B3", "B5", "B7", "B10", "B15", "B20", "C5", "C10")
 
-# Fewest poses for an estimate of the noise.
+# Fewest poses from which the noise is estimated.
 MIN_POSES = 13
-# Fewest motion pairs of a candidate.
+# Fewest motion pairs of a candidate that is compared.
 _MIN_PAIRS = 6
 
 
 @dataclass(frozen=True)
 class ReferenceChoice:
-    """A reference and the candidates it was chosen from.
+    """Chosen reference, and the candidates for it.
 
     Attributes
     ----------
@@ -55,10 +55,10 @@ def select_reference(
 ) -> ReferenceChoice:
     """Choose the reference for a method.
 
-    The residual does not indicate the best reference (Välimäki et al. 2023, section 4.2). The
-    answer X0 of the adaptive estimator does. Its error is smaller. As the error of the best linear
-    estimator, it is also uncorrelated with the distance between X0 and other answers. So the answer
-    nearest to X0 is probably the best answer.
+    The residual does not reveal the best reference (Välimäki et al. 2023, section 4.2), but the
+    answer X0 of the adaptive estimator does. X0 has a smaller error than the candidates. As the
+    best linear estimator, its error is uncorrelated with the distances between X0 and the
+    candidates. So the candidate nearest to X0 is probably the best.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Detect drives on which only rocking on the vehicle's springs reveals the vertical lever arm.
 
-On a flat road a body on springs rolls and pitches by some tenths of a degree, in proportion to its
-acceleration. Errors of clock, scale, scan distortion and navigation filters also follow the
-acceleration. So such an error looks like a lever arm along the vertical. On one car, two pairs of
-sensors had a vertical lever arm that was wrong by 1.2 to 1.6 m at a stated sigma of 0.16 m.
+On a flat road, a body on springs rolls and pitches by some tenths of a degree, in proportion to its
+acceleration. Errors of clock, scale, scan distortion and navigation filters are also in proportion
+to the acceleration, and so look like a vertical lever arm. On one car, the vertical lever arm
+between two pairs of sensors was wrong by 1.2 to 1.6 m with a sigma of 0.16 m.
 
 The test regresses the change of tilt about the level axes on the change of acceleration along them,
 over half a second: ``tilt = K acceleration + noise``. A large coefficient of determination means
@@ -18,39 +18,40 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 
-# Largest tilt (rad) of a vehicle on a flat road: root mean square of the change of tilt, over the
-# baseline with the largest value. Measured: 0.50 to 0.74 deg on ten recordings of one car, 0.86 to
-# 2.3 deg on nine drives through hilly towns.
+# A road is flat if the tilt (rad) of the vehicle is smaller than this. The tilt is the root mean
+# square of its change, at the baseline with the largest value. Measured: 0.50 to 0.74 deg in ten
+# recordings of one car on flat roads, 0.86 to 2.3 deg on nine drives through hilly towns.
 _FLAT_RAD = float(np.radians(0.8))
 
-# Smallest coefficient of determination of the tilt by acceleration if springs cause the tilt.
-# Measured: 0.15 to 0.34 on the same car, at most 0.02 on simulated vehicles without springs.
+# Springs cause the tilt if the coefficient of determination by acceleration exceeds this. Measured:
+# 0.15 to 0.34 on the same car, at most 0.02 on simulated vehicles without springs.
 _EXPLAINED = 0.12
 
-# Largest tilt of a vehicle that turns about one axis, as a share of the rotation about that axis.
+# A vehicle turns about one axis if its tilt is below this share of the rotation about this axis.
 _SHARE_OF_TILT = 0.04
 
-# Time (s) over which accelerations and changes of tilt are computed. Springs settle faster.
+# Time (s) over which changes of velocity and of tilt are computed. Springs settle faster.
 _SPRING_S = 0.5
 
-# Time (s) between the poses that are used.
+# Interval (s) between the poses that are used.
 _STEP_S = 0.1
 # Largest number of poses that are used.
 _MOST_POSES = 10_000
 # Fewest poses that are used.
 _LEAST_POSES = 60
-# Number of baselines at which the tilt is computed, from one pose to a tenth of the recording.
+# Number of baselines at which the tilt is computed. They range from one pose to a tenth of the
+# recording.
 _BASELINES = 6
 
 
 def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
-    """Return the axis along which only rocking on springs reveals a lever arm.
+    """Return the axis along which only rocking on springs reveals the lever arm, or None.
 
     Returns
     -------
     (3,) array or None
-        Unit vector in the parent sensor's frame; None if other motion tilts the sensors, or there
-        are too few poses.
+        Unit vector in the parent sensor's frame. None if other motion tilts the sensors, and for
+        too few poses.
     """
     stamps_ns = pose_pairs.stamps_ns
     step_s = median(np.diff(stamps_ns)) * 1e-9
@@ -64,8 +65,8 @@ def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
     parent_axis = _turning_axis(se3.rotation_of(Ts_pw_p))
     if parent_axis is None:
         return None
-    # Noise increases the tilt and decreases the share that acceleration explains. The less noisy
-    # stream decides.
+    # Noise increases the tilt, and decreases the share that acceleration explains. Therefore the
+    # less noisy stream decides.
     parent_tilt_rad = _largest_tilt(se3.rotation_of(Ts_pw_p))
     child_tilt_rad = _largest_tilt(se3.rotation_of(Ts_cw_c))
     if min(parent_tilt_rad, child_tilt_rad) > _FLAT_RAD:
@@ -80,13 +81,13 @@ def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
 def _products(rotations: FloatArray, baseline: int) -> FloatArray:
     """Return the lever arm products (3, 3) of the motions between poses.
 
-    Their eigenvector of the smallest eigenvalue is the axis of most rotation.
+    The eigenvector of the smallest eigenvalue is the axis with most rotation.
 
     Parameters
     ----------
     rotations : (N, 3, 3) array
     baseline : int
-        Number of poses from the start to the end of a motion.
+        Number of poses between the start and the end of a motion.
     """
     motions = se3.relative_rotations(
         rotations[:-baseline], rotations[baseline:]
@@ -95,7 +96,7 @@ def _products(rotations: FloatArray, baseline: int) -> FloatArray:
 
 
 def _turning_axis(rotations: FloatArray) -> FloatArray | None:
-    """Return the axis (3,) in the sensor's frame that nearly all rotation is about, or None."""
+    """Return the axis (3,) of nearly all rotation in the sensor's frame, or None."""
     products = _products(rotations, len(rotations) // 10)
     powers, directions = np.linalg.eigh(products)
     is_single = powers[0] < _SHARE_OF_TILT**2 * powers[2]
@@ -103,7 +104,7 @@ def _turning_axis(rotations: FloatArray) -> FloatArray | None:
 
 
 def _largest_tilt(rotations: FloatArray) -> float:
-    """Return the root mean square of the tilt (rad), at the baseline with the largest value."""
+    """Return the root mean square tilt (rad), at the baseline with the largest value."""
     longest = len(rotations) // 10
     baselines = np.geomspace(1, longest, _BASELINES).astype(int)
     powers = []

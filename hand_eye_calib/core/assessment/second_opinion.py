@@ -5,10 +5,10 @@ difference d of another estimate from the result then has the variance
 
     Var(d) = Var(other estimate) - Var(result)
 
-(J. A. Hausman, *Specification tests in econometrics*, Econometrica 46, 1978). Each stride, the
-number of poses that a motion spans, leads to another estimate from the same poses. The excess of an
-estimate is ``d^2 - Var(d)``, or zero if this is negative. The median of the excesses is the
-variance that the noise model misses.
+(J. A. Hausman, *Specification tests in econometrics*, Econometrica 46, 1978). The estimates differ
+in their stride, the number of poses that a motion spans. The excess of an estimate is ``d^2 -
+Var(d)``, or zero if this is negative. The median excess is the variance that the noise model
+misses.
 """
 
 from collections.abc import Sequence
@@ -26,13 +26,12 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers.robust import RobustSolution, solve_strides
 
-# Largest standard deviation of an estimate, divided by the one of the result, from which an excess
-# is computed. A less certain estimate may be far from the result by chance: its excess is zero.
-# Chosen among 2, 3 and no limit on recordings of KinHEC 1.1 and on the simulated classes: the
-# smallest widening at equal coverage.
+# The excess of an estimate is zero if its standard deviation exceeds that of the result by this
+# factor: it may be far from the result by chance. Chosen among 2, 3 and no limit on recordings of
+# KinHEC 1.1 and on the simulated classes: smallest widening at equal coverage.
 _MAX_SIGMA_RATIO = 2.0
 
-# The iteration ends at a step below this share of the standard deviation of the estimate.
+# The iteration ends if the step is below this share of the standard deviation of the estimate.
 _STEP_TOLERANCE = 0.1
 
 
@@ -41,7 +40,7 @@ def second_opinions(
 ) -> tuple[Assessment, ...]:
     """Return estimates of the extrinsic by robust least squares, one for each of several strides.
 
-    A stride is the number of poses that a motion spans. Strides whose solve does not converge are
+    A stride is the number of poses that a motion spans. A stride whose solve does not converge is
     omitted.
 
     Parameters
@@ -50,7 +49,7 @@ def second_opinions(
         Synchronised poses of both sensors. The time offset and the scale of the result are already
         applied.
     T_parent_child : (4, 4) array
-        Result of the noise model, at which the solves start.
+        Result of the noise model. The solves start there.
     """
     strides = solve_strides(Ts_pw_p, Ts_cw_c, T_parent_child, _STEP_TOLERANCE)
     return tuple(
@@ -71,14 +70,14 @@ def assess_robust(pairs: MotionPairs, solution: RobustSolution) -> Assessment:
 def excess_covariance(
     answer: Assessment, opinions: Sequence[Assessment]
 ) -> FloatArray:
-    """Return the covariance that the noise model misses, estimated from second opinions.
+    """Return the covariance that the noise model misses, estimated from the second opinions.
 
     Parameters
     ----------
     answer : Assessment
         Result of the noise model.
     opinions : sequence of Assessment
-        Estimates of :func:`second_opinions`. Without any, the covariance is zero.
+        Estimates of :func:`second_opinions`. If empty, the covariance is zero.
 
     Returns
     -------
