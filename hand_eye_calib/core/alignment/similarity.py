@@ -5,14 +5,14 @@ satisfy for all motion pairs A = (R_A, t_A) and B = (R_B, t_B)
 
     (R_A - I) t + t_A = s R t_B,      R_A R = R R_B,      B = B(d).
 
-The methods of this package assume one clock and one unit of length. If these are not certain, this
-fit is made first. It needs no initial value and tolerates a minority of outliers. Its residuals
-decide whether both streams can be on one rigid body.
+The methods of this package assume one clock and one unit of length. If they are uncertain, this fit
+is made first. It needs no initial value, and tolerates a minority of outliers. Its residuals show
+whether both streams can be on one rigid body.
 
-Starts come from small random subsets of the motion pairs. In a start, any 3 x 3 matrix M takes the
-place of s R, so that the quadratic form of :mod:`~hand_eye_calib.core.solvers.quadratic_form` in
-(vec M, t, 1) has a minimum in closed form. Gauss-Newton steps with Geman-McClure weights refine the
-best starts.
+The first values come from small random subsets of the motion pairs (starts). Any 3 x 3 matrix M
+replaces s R in a start. Then the quadratic form of
+:mod:`~hand_eye_calib.core.solvers.quadratic_form` in (vec M, t, 1) has its minimum in closed form.
+Gauss-Newton steps with Geman-McClure weights refine the best starts.
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,10 @@ from hand_eye_calib.core.solvers import all_pairs, quadratic_form
 # Number of random subsets of motion pairs, each of which yields a start.
 _N_SUBSETS = 32
 
-# Sizes of the subsets in motion pairs, used in turn.
+# Sizes of the subsets in motion pairs. They are used in turn.
 _SUBSET_SIZES = (12, 24, 48)
 
-# Largest number of motion pairs that the subsets are drawn from.
+# Largest number of motion pairs from which the subsets are drawn.
 _MAX_RANKED_PAIRS = 300
 
 # Number of the best starts that are refined.
@@ -47,43 +47,42 @@ _N_REFINED_STARTS = 3
 # Largest number of Gauss-Newton steps.
 _MAX_STEPS = 30
 
-# Gauss-Newton ends if a step is shorter than this, in standard deviations of the unknowns.
+# Gauss-Newton ends if the step, in standard deviations of the unknowns, is shorter than this.
 _STEP_TOLERANCE = 1e-2
 
-# Residual, in standard deviations, at which the robust weight is a quarter.
+# A residual of this number of standard deviations has a quarter of the full robust weight.
 _QUARTER_WEIGHT_SIGMAS = 3.0
 
 # Number of blocks of time for the jackknife and for the clock rate.
 _N_BLOCKS = 10
 
-# A fit is good if it leaves a smaller share of the motion unexplained. No further fits are tried.
+# A fit that leaves a smaller share of the motion unexplained is good: no further fits are tried.
 EXPLAINED = 0.03
 
-# Scale and offset of a fit are used only if it leaves a smaller share of the translations
-# unexplained.
+# Scale and offset of a fit are used only if the unexplained share of the translations is smaller.
 _MAX_UNEXPLAINED_TRANSLATION = 0.3
 
-# Lower bound of the standard deviation of rotations (rad). Smaller ones are rounding.
+# Lower bound of the standard deviation of rotations (rad). A smaller value is rounding.
 _MIN_SIGMA_ROTATION = 1e-7
 
-# Lower bound of the standard deviation of translations, as a share of the translation of motions.
+# Lower bound of the standard deviation of translations, as a share of the motions' translations.
 _MIN_SIGMA_TRANSLATION = 1e-9
 
 # Smallest number of motion pairs of a fit.
 MIN_PAIRS = 20
 
-# Durations (s) of the motions from which the scale is estimated; the best estimate is used. Long
-# motions usually determine the scale best.
+# Durations (s) of the motions from which the scale is estimated; the most certain estimate is used.
+# Long motions usually determine the scale best.
 _SCALE_LAGS_S = (3.0, 1.0, 8.0)
 
-# The units of length differ if the scale differs from 1 by more than this ...
+# The units of length differ if the scale differs from 1 by more than this limit ...
 _MIN_DIFFERENCE = 0.01
 
 # ... and by more than this number of standard deviations ...
 _MIN_SIGMAS = 5.0
 
-# ... and if a smaller share of the translations is unexplained, because many jumps may look like a
-# scale.
+# ... and if the unexplained share of the translations is smaller than this: many jumps may look
+# like a scale.
 _MAX_UNEXPLAINED_OF_OTHER_UNIT = 0.1
 
 # Number of unknowns: rho (3), phi (3), log s and d.
@@ -107,8 +106,8 @@ class SimilarityFit:
     scale : float
         s: factor from the child's unit of length to the parent's.
     offset_s : float
-        d: seconds to be added to the child's stamps, on top of the offset that was applied before.
-        0 if no velocities (``twists``) were given.
+        d: seconds to be added to the child's stamps, after the offset that was already applied. 0
+        if the velocities (``twists``) are missing.
     sigmas : (8,) array
         Standard deviations of (rho, phi, log s, d), by the delete-a-block jackknife over time. Zero
         for unknowns that were not estimated.
@@ -118,18 +117,18 @@ class SimilarityFit:
         Derivatives of (rho, phi) with respect to log s and to d.
     offsets_of_blocks : (2, B) array
         Estimate of a further change of d (s) from each of B blocks of time, at this X and s, and
-        the weight of this estimate. Zero if no velocities were given.
+        the weight of each estimate. Zero if the velocities are missing.
     curvature_share : float
-        Curvature of the cost with respect to d, over the curvature for constant robust weights; at
-        most 1. The estimates of a block are too small by this factor, because they assume constant
-        weights.
+        Curvature of the cost with respect to d, divided by the curvature for constant robust
+        weights; at most 1. The estimate from a block assumes constant weights, and is too small by
+        this factor.
     sigma_translation, sigma_rotation : float
         Robust standard deviations per axis of the residuals, m and rad.
     unexplained_translation, unexplained : float
-        Residuals as a share of the translations, and of the whole motion. Translations count as
-        those of the stream that moves less in the parent's unit: a scale near zero explains
-        nothing, even if it makes the residuals small. If the scale is fixed at 1, they count as
-        those of the stream that moves more.
+        Residuals as a share of the translations, and as a share of the whole motion. The share
+        refers to the stream that moves less in the parent's unit. Otherwise, a scale near zero
+        would make the share small without explaining anything. If the scale is fixed at 1, the
+        share refers to the stream that moves more.
     explains_translation : bool
         Whether the fit explains enough of the translations to trust its scale and offset.
     is_in_one_unit : bool
@@ -137,8 +136,8 @@ class SimilarityFit:
     has_own_unit : bool
         Whether s certainly differs from 1 by more than 1 %.
     scale_bias : float
-        Difference between s and the scale of a fit with exchanged streams. Noise of the child
-        causes it. Zero unless the units of length differ.
+        s minus the scale of a fit with exchanged streams. Noise of the child causes this
+        difference. Zero unless the units of length differ.
     """
 
     T_parent_child: FloatArray
@@ -179,15 +178,15 @@ def fit_similarity(
     start : SimilarityFit or (4, 4) array, optional
         Fit or X as initial value. By default, starts are searched for.
     same_unit : bool
-        Fix the scale at 1. If the body only rotates about one of the sensors, this sensor hardly
-        moves, and any small scale would fit.
+        Fix the scale at 1. If the body only rotates about one sensor, this sensor hardly moves, and
+        any small scale would fit.
     max_unexplained : float, optional
         Starts that leave more than this share of the motion unexplained are not refined.
 
     Returns
     -------
     SimilarityFit
-        The best fit; the last start, not refined, if no start is good enough.
+        The best fit; if no start is good enough, the last start without refinement.
     """
     problem = _Problem(pairs, twists, same_unit)
     if isinstance(start, SimilarityFit):
@@ -206,7 +205,8 @@ def fit_similarity(
         if fits[-1].unexplained < EXPLAINED:
             break
     fits = fits or [problem.describe(T, scale, 0.0)]
-    # The best fit has the smallest volume of residuals, measured in the smaller unit of length.
+    # The best fit has the smallest residuals (product of both standard deviations), in the smaller
+    # unit of length.
     return min(
         fits,
         key=lambda fit: (
@@ -220,16 +220,16 @@ def estimate_scale(
 ) -> SimilarityFit:
     """Estimate the factor from the child's unit of length to the parent's.
 
-    Noise of the child makes the factor too small, because the child's lengths are the regressor.
-    The standard deviation does not contain this bias. If the streams are exchanged, the factor is
-    too large. The units of length differ (``has_own_unit``) only if they differ in both fits.
+    The child's lengths are the regressor, so noise of the child makes the factor too small. The
+    standard deviation does not contain this bias. With exchanged streams, the factor is too large.
+    The units of length differ (``has_own_unit``) only if they differ in both fits.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     first_fits : sequence of SimilarityFit, optional
-        Fits of the same streams that exist already, over the first durations in _SCALE_LAGS_S. By
-        default, all fits are computed.
+        Existing fits of the same streams, over the first durations in _SCALE_LAGS_S. By default all
+        fits are computed.
 
     Returns
     -------
@@ -265,8 +265,8 @@ def _best_scale(
 ) -> SimilarityFit:
     """Return the fit whose scale has the smallest relative standard deviation.
 
-    The unexplained share of the translations is added to the standard deviation of fits that do not
-    explain them. ``start`` is the initial value of the first fit.
+    If a fit does not explain the translations, their unexplained share is added to its standard
+    deviation. ``start`` is the initial value of the first fit.
     """
     fits = [*first_fits]
     for lag_s in _SCALE_LAGS_S[len(fits) :]:
@@ -293,20 +293,20 @@ def _best_scale(
 def settle_scale(
     pose_pairs: PosePairs, option: str | float
 ) -> tuple[float, SimilarityFit | None]:
-    """Return the scale for the value of the option ``scale``, and its fit if it is estimated.
+    """Return the scale according to the option ``scale``, and its fit if it was estimated.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     option : str or float
-        A scale, "none" for 1, "estimate" for an estimate, or "auto" for an estimate if the units of
-        length certainly differ, else 1.
+        A number is the scale itself; "none" stands for 1, and "estimate" for an estimate. "auto"
+        stands for an estimate if the units of length certainly differ, and for 1 otherwise.
 
     Raises
     ------
     NotEnoughDataError
-        If the option is "estimate" and the scale cannot be estimated, or if it is "auto", the units
-        differ, and the fit does not explain the translations.
+        With "estimate", if the scale cannot be estimated. With "auto", if the units differ and the
+        fit does not explain the translations.
     """
     if not isinstance(option, str):
         return option, None
@@ -333,13 +333,13 @@ def settle_scale(
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     """Return the best starts (X, scale), the best first.
 
-    Candidates are the solutions for random subsets of the pairs, and those for all pairs at the
-    start rotations of dnl. One subset without outliers suffices.
+    Candidates are the solutions for random subsets of the pairs, and the solutions for all pairs at
+    the start rotations of dnl. A single subset without outliers is sufficient.
     """
     n_ranked = min(len(pairs), _MAX_RANKED_PAIRS)
     ranked = np.linspace(0, len(pairs) - 1, n_ranked).astype(int)
     few = pairs[ranked]
-    # Lengths in units of the root mean square translation of each stream.
+    # Divide lengths by the root mean square translation of their stream.
     parent = few.Ts_parenti_parentj.copy()
     child = few.Ts_childi_childj.copy()
     unit_of_parent = max(_rms_translation(parent), 1e-12)
@@ -353,10 +353,10 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     rotations = np.concatenate(
         [_closed_form_rotations(subset_forms), more_rotations]
     )
-    # The further rotations belong to the form of all pairs.
+    # The start rotations of dnl belong to the quadratic form of all pairs.
     forms_of_all = np.repeat(subset_forms[:1], len(more_rotations), axis=0)
     forms = np.concatenate([subset_forms, forms_of_all])
-    # Scale and translation that minimise the form of each rotation.
+    # For each rotation, scale and translation that minimise its form.
     reduced, to_translation = quadratic_form.without_translation(forms)
     vectors = np.append(
         rotations.reshape(-1, 9), np.zeros((len(forms), 1)), axis=1
@@ -364,7 +364,8 @@ def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
     products = se3.times(reduced, vectors)
     squares = (vectors * products).sum(axis=1)
     scales = -products[:, 9] / np.maximum(squares, 1e-300)
-    # Candidates without a sensible scale, of opposite or no motion, have large costs at scale 1.
+    # Opposite motion, or no motion, leads to an impossible scale. At scale 1 such candidates have
+    # large costs.
     scales[(scales <= 1e-3) | (scales >= 1e9)] = 1.0
     scaled_vectors = scales[:, None] * vectors + np.eye(10)[9]
     translations = -se3.times(to_translation, scaled_vectors)
@@ -385,7 +386,7 @@ def _rms_translation(motions: FloatArray) -> float:
 
 
 def _random_subsets(n_pairs: int) -> FloatArray:
-    """Return subsets of motion pairs as rows of weights 0 or 1. The first row is all pairs."""
+    """Return subsets of motion pairs as rows of weights 0 or 1. The first row has all pairs."""
     random = np.random.default_rng(0)
     subsets = np.zeros((1 + _N_SUBSETS, n_pairs))
     subsets[0] = 1.0
@@ -396,7 +397,7 @@ def _random_subsets(n_pairs: int) -> FloatArray:
 
 
 def _closed_form_rotations(forms: FloatArray) -> FloatArray:
-    """Return the rotations nearest to the matrices M that minimise quadratic forms.
+    """Return the rotations that are nearest to the matrices M with minimal quadratic forms.
 
     In flat motion the smallest singular value of M is arbitrary. Its sign is chosen so that the
     result is a rotation.
@@ -413,7 +414,7 @@ def _closed_form_rotations(forms: FloatArray) -> FloatArray:
     left = forms[:, :12, :12]
     traces = np.trace(left, axis1=1, axis2=2)
     left = left + 1e-9 * traces[:, None, None] * np.eye(12)
-    # The forms of streams that never move are zero.
+    # The quadratic form of streams that never move is zero.
     left = left + np.finfo(float).tiny * np.eye(12)
     minima = -np.linalg.solve(left, forms[:, :12, 12:])
     matrices = minima[:, :9, 0].reshape(-1, 3, 3)
@@ -455,8 +456,8 @@ class _Problem:
         if twists is not None:
             self.free.append(_OFFSET)
         twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
-        # Derivatives of B with respect to d. If d is added to the stamps of the child, its pose at
-        # an instant is the pose that it had d earlier.
+        # Derivatives of B with respect to d. If d is added to the child's stamps, its pose at an
+        # instant is the pose that it had d seconds earlier.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
         self.rotation_by_offset = rotated_i - twists_j[:, 3:]
         moved_i = twists_i[:, :3] + se3.cross(
@@ -473,10 +474,10 @@ class _Problem:
         Returns
         -------
         parts : list of two (K, 3, 9) arrays
-            One array for translations, one for rotations. Columns: derivatives of the residuals
-            with respect to (rho, phi, log s, d), then the residuals. X changes to
-            ``(R Exp(phi), t + R rho)``; residuals are in the parent's axes. All values are divided
-            by the standard deviations of the residuals and multiplied by ``root``.
+            One array for translations, one for rotations. The columns are the derivatives of the
+            residuals with respect to (rho, phi, log s, d), then the residuals. X changes to ``(R
+            Exp(phi), t + R rho)``; residuals are in the parent's axes. All values are divided by
+            the standard deviations of the residuals and multiplied by ``root``.
         sigmas : (float, float)
             Standard deviations per axis of the residuals, m and rad.
         root : (K,) array
@@ -536,7 +537,7 @@ class _Problem:
     def refine(
         self, T: FloatArray, scale: float
     ) -> tuple[FloatArray, float, float]:
-        """Return X, scale and offset after Gauss-Newton steps with robust weights."""
+        """Return X, scale and offset after Gauss-Newton steps with robust weights from a start."""
         offset_s = 0.0
         for _ in range(_MAX_STEPS):
             moments = np.zeros((_N_UNKNOWNS + 1,) * 2)
@@ -545,7 +546,7 @@ class _Problem:
                 moments += flat.T @ flat
             step = np.zeros(_N_UNKNOWNS)
             step[self.free] = -solve(moments, self.free)
-            # At most 1 rad of rotation, and a factor e of the scale.
+            # A step is limited to a rotation of 1 rad and a factor e of the scale.
             size = max(np.linalg.norm(step[3:6]), abs(step[_SCALE]), 1e-300)
             step *= min(1.0, 1.0 / size)
             T = se3.retracted(T, step[:6])
@@ -562,7 +563,8 @@ class _Problem:
 
         ``sigmas`` are the standard deviations of the residuals, m and rad.
         """
-        # Of the stream that moves less; if the scale is fixed, of the stream that moves more.
+        # Use the lengths of the stream that moves less; if the scale is fixed, of the one that
+        # moves more.
         lengths = (self.rms_a, scale * self.rms_b)
         rms_translation = min(lengths) if _SCALE in self.free else max(lengths)
         of_translation = sigmas[0] / max(rms_translation, 1e-12)
@@ -581,8 +583,9 @@ class _Problem:
         by_scale = -solve(blocks.total, range(_SCALE), _SCALE)
         by_offset = -solve(blocks.total, range(_SCALE), _OFFSET)
         weights = blocks.sums[:, _OFFSET, _OFFSET]
-        # A step of d with constant robust weights is too short, because the weights of a block
-        # change as d changes. Geman-McClure weights reduce the curvature of the cost by this share.
+        # A step of d for constant robust weights is too short, because the weights of a block
+        # change with d. This is the share to which Geman-McClure weights reduce the curvature of
+        # the cost.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
         fall = (
             pulls.sum()

@@ -1,7 +1,7 @@
 """Offset and rate of the child's clock.
 
-The offset (s) is to be added to the child's stamps, so that they are on the parent's clock. The
-rate is the change of the offset per second. The coarse offset comes from the angular rates
+The offset (s) is added to the child's stamps to convert them to the parent's clock. The rate is the
+change of the offset per second. The coarse offset comes from the angular rates
 (:mod:`~hand_eye_calib.core.alignment.rate_correlation`). The fine offset is estimated together with
 X and the scale (:mod:`~hand_eye_calib.core.alignment.similarity`).
 """
@@ -33,42 +33,43 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.results.records import ClockRate
 
-# Durations (s) of the motions that the offset is estimated from, one fit for each. The fit with the
-# smallest standard deviation is used; it is usually that of short motions.
+# Durations (s) of the motions from which the offset is estimated, with one fit per duration. The
+# fit with the smallest standard deviation is used, usually that of short motions.
 _LAGS_S = (1.0, 0.3, 3.0)
 
-# Largest number of motions of a fit with a clock rate.
+# Largest number of motions in a fit that estimates a clock rate.
 _MAX_PAIRS_OF_RATE = 5 * MAX_PAIRS
 
-# The child's velocity at a stamp is its motion from one half span before to one half span after it.
-# Velocities over a shorter span are noisy. Those over a longer span share poses with the motion
-# pair. Both bias the offset and make its standard deviation too small. Smallest half span (s):
+# The child's velocity at a stamp is its motion from half a span before to half a span after the
+# stamp. Over a short span, velocities are noisy; over a long span, they share poses with the motion
+# pair. Both errors bias the offset, and make its standard deviation too small. Smallest half span
+# (s):
 _MIN_SPAN_S = 0.05
-# Largest half span (s) that is chosen because of noise.
+# Largest half span (s) for noisy streams:
 _MAX_SPAN_S = 0.3
 
-# Smallest half span in intervals of the child's stream.
+# Smallest half span, in intervals between poses of the child:
 _SPAN_INTERVALS = 2.0
 
 # Half span for noisy streams: this factor times the time in which the body rotates by one standard
-# deviation of the residual rotations.
+# deviation of the rotation residuals.
 _SPAN_OF_NOISE = 1.4
 
-# Largest number of linearisations of a fit.
+# Largest number of linearisations in a fit.
 _MAX_ROUNDS = 8
 
-# The linearisations end if the offset changes by less than this (s).
+# Linearisation ends if the offset changes by less than this (s).
 _SETTLED_S = 2e-5
 
 # Prior standard deviation of a clock rate (s/s). 75 ppm are usual for USB devices.
 _RATE_PRIOR = 1e-4
 
-# Smallest clock rate that the stamps are corrected for, in standard deviations.
+# Stamps are corrected for a clock rate only if it exceeds this number of standard deviations.
 _MIN_RATE_SIGMAS = 4.0
 
-# Largest plausible difference between fine and coarse offset (s) ...
+# Largest plausible difference (s) between fine and coarse offset ...
 _FINE_RANGE_S = 0.25
-# ... or in intervals of the slower stream, if that is longer.
+# ... or, if it is longer, this number of intervals of the slower stream.
 _FINE_RANGE_INTERVALS = 2.0
 
 
@@ -77,7 +78,7 @@ _NO_CORRELATION = Correlation()
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate of a clock offset. The defaults mean that there is no estimate.
+    """Estimate of a clock offset. The default values mean that no estimate exists.
 
     Attributes
     ----------
@@ -90,8 +91,8 @@ class TimeOffset:
     fit : SimilarityFit or None
         Fit with the fine offset; None if no fit explains the motion.
     spread_s : float
-        Largest difference between the offsets from motions of different durations; infinite unless
-        there is a fit for each duration.
+        Largest difference between the offsets from motions of different durations. It is infinite
+        if a duration has no fit.
     rate : ClockRate or None
         Change of the offset with time; None if no fit explains the motion, or if the recording is
         too short.
@@ -105,7 +106,7 @@ class TimeOffset:
     rate: ClockRate | None = None
 
     def steadied(self, child: Trajectory) -> Trajectory:
-        """Return the child with stamps corrected for the clock rate, if a rate was estimated."""
+        """Return the child with stamps corrected for the clock rate; unchanged without a rate."""
         if self.rate is None:
             return child
         return child.shifted(0.0, self.rate.used, self.rate.at_ns)
@@ -124,8 +125,8 @@ def estimate_time_offset(
 ) -> TimeOffset:
     """Estimate the offset of the child's clock.
 
-    The coarse offset comes from the angular rates. The fine offset comes from a fit together with X
-    and the scale.
+    The coarse offset comes from the angular rates, and the fine offset from a fit of X, scale and
+    offset.
 
     Parameters
     ----------
@@ -134,7 +135,7 @@ def estimate_time_offset(
     max_gap_s : float
         Longest interval (s) between two poses in which poses are interpolated.
     of_speed : bool
-        Estimate only the coarse offset, from speeds, because a sensor has no orientation.
+        Whether a sensor has no orientation. Only a coarse offset is then estimated, from speeds.
 
     Returns
     -------
@@ -143,7 +144,7 @@ def estimate_time_offset(
     Raises
     ------
     NotEnoughDataError
-        If the coarse offset cannot be trusted; the message contains the reason.
+        If the coarse offset cannot be trusted; the message has the reason.
     InputError
         If a stream's stamps leap by days.
     """
@@ -178,18 +179,18 @@ def refine_time_offset(
     ----------
     parent, child : Trajectory
     at : TimeOffset
-        Initial value. Its correlation contains the coarse offset.
+        Initial value. Its correlation has the coarse offset.
     max_gap_s : float
         Longest interval (s) between two poses in which poses are interpolated.
     negligible_s : float
-        Offset (s) that is negligible for the caller. After a fit with a smaller offset, no further
-        durations are tried.
+        Offset (s) that the caller can neglect. If a fit has a smaller offset, no further durations
+        are tried.
 
     Returns
     -------
     TimeOffset
-        The refined offset. The coarse offset, with a large standard deviation, if no fit explains
-        the motion.
+        Refined offset. If no fit explains the motion: the coarse offset with a large standard
+        deviation.
     """
     reach_s = max(
         _FINE_RANGE_S,
@@ -211,7 +212,7 @@ def refine_time_offset(
             break
     if len(offsets_s) < len(_LAGS_S):
         return best
-    # Errors that are correlated for longer than a block of the jackknife make these offsets differ.
+    # The offsets differ if errors are correlated for longer than a block of the jackknife.
     sigma_s = float(np.hypot(best.sigma_s, np.std(offsets_s, ddof=1)))
     return replace(best, spread_s=np.ptp(offsets_s), sigma_s=sigma_s)
 
@@ -238,8 +239,8 @@ def offset_over(
     max_gap_s : float
         Longest interval (s) between two poses in which poses are interpolated.
     negligible_s : float
-        Offset (s) that is negligible for the caller. The iteration ends early if the offset is
-        clearly smaller; otherwise it ends if the offset changes by less than a twentieth of it.
+        Offset (s) that the caller can neglect. The iteration ends early if the offset is clearly
+        smaller. Otherwise it ends if the offset changes by less than a twentieth of this value.
     start : SimilarityFit or (4, 4) array, optional
         Initial fit or X, if ``at`` has no fit.
     max_unexplained : float, optional
@@ -286,7 +287,7 @@ def offset_over(
 def _is_small_step(
     step_s: float, offset_s: float, settled_s: float, negligible_s: float
 ) -> bool:
-    """Whether the last step ends the iteration: small in itself, or of a negligible offset."""
+    """Return whether the last step ends the iteration: a small step, or a negligible offset."""
     return (
         abs(step_s) < settled_s
         or abs(offset_s) + abs(step_s) < negligible_s / 2
@@ -301,7 +302,7 @@ def _unknown_rate(child: Trajectory) -> ClockRate:
 
 
 def _span_of_noise_s(fit: SimilarityFit, twists: FloatArray) -> float:
-    """Return the half span (s) of velocities that noise requires, from velocities (M, 6)."""
+    """Return the half span (s) that noise requires for velocities (M, 6)."""
     squared_rates = (twists[:, 3:] ** 2).sum(axis=1)
     rms_rate = float(np.sqrt(np.mean(squared_rates)))
     span_s = _SPAN_OF_NOISE * fit.sigma_rotation / max(rms_rate, 1e-9)
@@ -314,16 +315,16 @@ def _fit_of(
     start: SimilarityFit | FloatArray | None,
     max_unexplained: float | None,
 ) -> SimilarityFit:
-    """Fit X, scale and offset; only X and offset if the scale makes the fit fail.
+    """Fit X, scale and offset. If the scale makes the fit fail, fit only X and offset.
 
-    ``max_unexplained`` is that of :func:`offset_over`. If it is given, there is only one attempt.
+    With ``max_unexplained``, see :func:`offset_over`, there is only one attempt.
     """
     fit = fit_similarity(
         pairs, twists, start=start, max_unexplained=max_unexplained
     )
     if fit.explains_translation or max_unexplained is not None:
         return fit
-    # The motion does not determine the scale if the body rotates about one of its sensors.
+    # If the body rotates about one of its sensors, the motion does not determine the scale.
     in_one_unit = fit_similarity(pairs, twists, same_unit=True)
     return in_one_unit if in_one_unit.explains_translation else fit
 
@@ -331,11 +332,11 @@ def _fit_of(
 def _twists_of_pairs(
     child: Trajectory, stamps_ns: IntArray, pairs: MotionPairs, span_s: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocities (K, 6) of the child at the starts and at the ends of K motion pairs.
+    """Return velocities (K, 6) of the child at the first and at the last pose of K motion pairs.
 
-    ``stamps_ns`` are those of the pose pairs. See :func:`_twists`.
+    ``stamps_ns`` are the stamps of the pose pairs. See :func:`_twists`.
     """
-    # Motions share poses: the velocity at each pose is computed once.
+    # Motions share poses. Compute the velocity at each pose once.
     poses, index_of_pose = np.unique(
         np.r_[pairs.i, pairs.j], return_inverse=True
     )
@@ -349,8 +350,8 @@ def _twists(
 ) -> FloatArray:
     """Return velocities (N, 6), m/s and rad/s, of a sensor in its own frame at stamps (N,).
 
-    A velocity is the mean from ``span_s`` seconds before to ``span_s`` seconds after a stamp; less
-    at the ends of the trajectory.
+    A velocity is the mean from ``span_s`` seconds before to ``span_s`` seconds after a stamp. At
+    the ends of the trajectory the time is shorter.
     """
     span_ns = round(span_s * 1e9)
     first_ns, last_ns = trajectory.stamps_ns[[0, -1]]
@@ -369,9 +370,9 @@ def _rate(
 ) -> ClockRate:
     """Estimate the clock rate from the offsets of a fit in blocks of time.
 
-    The slope of a line through these offsets is a correction of ``before``. The variance of the
-    slope is that of Student's t distribution, because there are few blocks. The result is the mean
-    of the posterior with the prior _RATE_PRIOR.
+    The slope of a line through these offsets is a correction of ``before``. Because the blocks are
+    few, the variance of the slope is that of Student's t distribution. The result is the posterior
+    mean with the prior _RATE_PRIOR.
 
     Parameters
     ----------
@@ -379,7 +380,7 @@ def _rate(
     stamps_ns : (K,) int64 array
         Stamps of the motion pairs, on the parent's clock.
     before : ClockRate
-        Rate that the child's stamps were corrected for in the fit.
+        Rate for which the child's stamps were already corrected in the fit.
 
     Returns
     -------
@@ -396,7 +397,7 @@ def _rate(
     spread = float(weights @ times_s**2)
     slope = float(weights @ (times_s * centred_s)) / spread
     residuals_s = centred_s - slope * times_s
-    # Student's t for n - 2 degrees of freedom has the variance (n - 2) / (n - 4).
+    # Student's t distribution with n - 2 degrees of freedom has the variance (n - 2) / (n - 4).
     variance = float(weights @ residuals_s**2) / (len(offsets_s) - 4) / spread
     variance /= fit.curvature_share**2
     total = (before.used + slope) * _RATE_PRIOR**2 / (_RATE_PRIOR**2 + variance)
