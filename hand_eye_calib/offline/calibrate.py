@@ -32,6 +32,7 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
 from hand_eye_calib.formats.files import path_of
+from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.offline.beside_motion import switched_off, with_measurements
 
 MethodName: TypeAlias = Literal[
@@ -238,6 +239,7 @@ def _read_bag(
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
 
+    refuse_saved_result(path)
     if path.suffix in _TABLES and path.is_file():
         raise InputError(
             f"{path} is one file: pass the trajectories of both sensors; samples of an arm are for "

@@ -137,9 +137,9 @@ TABLE = """
 1 | info lidar.tum | a file of poses, not a saved result: calibrate PARENT CHILD --out DIR
 1 | info torn.yaml | torn.yaml is not readable YAML
 1 | compare torn.yaml --with robot.urdf | restore the file, or calibrate again
-1 | calibrate saved | saved is a saved result: show it with hand_eye_calib info saved
-1 | check saved | saved is a saved result, not a bag: hand_eye_calib info saved
-1 | calibrate saved/extrinsic.yaml | show it with hand_eye_calib info saved/extrinsic.yaml
+1 | calibrate saved | a saved result, not a recording: display it with hand_eye_calib info saved
+1 | check saved | a saved result, not a recording: display it with hand_eye_calib info saved
+1 | calibrate saved/extrinsic.yaml | display it with hand_eye_calib info saved/extrinsic.yaml
 2 | lidar.tum camera.tum | a command comes first: hand_eye_calib calibrate lidar.tum camera.tum
 1 | compare saved | or one and the installed transform (--with
 1 | compare saved saved | saved appears twice: name each result once
@@ -170,15 +170,19 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum -o x | unknown '-o'; did you mean --out? (
 2 | calibrate lidar.tum camera.tum --mathod park | did you mean --method?
 1 | calibrate lidar.tum camera.tum --time-offset 1000 | leave it out, they overlap without it
-1 | calibrate lidar.tum saved/extrinsic.yaml | extrinsic.yaml is a saved result: show it with
-1 | calibrate lidar.tum saved | saved is a saved result: show it with hand_eye_calib info saved
+1 | calibrate lidar.tum saved/extrinsic.yaml | extrinsic.yaml is a saved result, not a
+1 | calibrate lidar.tum saved | a saved result, not a recording: display it with
 2 | saved | a command comes first: hand_eye_calib info saved
 2 | replay lidar.tum camera.tum | trajectory files: hand_eye_calib calibrate lidar.tum camera.tum
 2 | watch lidar.tum | watch takes no file: it displays the running node
 2 | calibrate "lidar.tum camera.tum" | leave out the quotes and commas: lidar.tum camera.tum
 2 | calibrate lidar.tum,camera.tum | 2 files in one argument: leave out the quotes and commas
 2 | calibrate lidar.tum camera.tum --prior z=1+/-1 yaw=1+/-1 | repeat --prior before each axis
-2 | calibrate lidar.tum camera.tum --prior z=1+/-1 --prior z=2+/-1 | --prior z is given twice
+2 | calibrate lidar.tum camera.tum --prior z=1+/-1 --prior z=2+/-1 | z was given twice; keep one
+2 | calibrate lidar.tum camera.tum --method dnlo --method auto | --method was given twice; keep one
+2 | calibrate lidar.tum camera.tum --out=a --out b | --out was given twice; keep one
+2 | batch drive.mcap --jobs 1 --jobs 2 | --jobs was given twice; keep one
+2 | calibrate lidar.tum camera.tum --label a=1 a=2 | --label a was given twice; keep one
 2 | arm lidar.tum camera.tum --parent-angles foo | --parent-angles must be one of abb, fanuc
 2 | calibrate lidar.tum camera.tum --topics /a /b | --topics applies to bags only
 2 | calibrate lidar.tum camera.tum --out "" | the name is empty

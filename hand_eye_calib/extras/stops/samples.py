@@ -27,6 +27,7 @@ from hand_eye_calib.core.geometry.frames import numbers_of, pose_of, pose_stack
 from hand_eye_calib.extras.stops.pose_files import read_pose_folder
 from hand_eye_calib.formats.files import LONGEST_NAME, path_of
 from hand_eye_calib.formats.npz import read_arrays
+from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # Names of the two poses of a sample in files of other programs: robot first, then target.
@@ -145,6 +146,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     (40, 4, 4)
     """
     path = path_of("path", path)
+    refuse_saved_result(path)
     if path.is_dir():
         robot, tracking = read_pose_folder(path)
         return ArmSamples(robot, tracking, {})
@@ -198,11 +200,6 @@ def _samples_in(path: str | Path, document: Any) -> list[Any]:
     """
     samples = document
     if isinstance(document, Mapping):
-        if "T_parent_child" in document:
-            raise InputError(
-                f"{path} is a saved result: show it with hand_eye_calib info {path}, or pass the "
-                "streams again"
-            )
         has_list = "samples" in document
         samples = (
             document["samples"] if has_list else [*_numbered_pairs(document)]

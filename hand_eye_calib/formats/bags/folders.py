@@ -21,7 +21,7 @@ from hand_eye_calib.formats.bags.storage import (
     reason_of,
     zstd_module,
 )
-from hand_eye_calib.formats.results import FILE_NAME
+from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # What a path of a bag may be, for messages.
@@ -159,7 +159,13 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def _no_files(folder: Path) -> str:
-    """Return the message for a folder without storage files: what is missing, or where bags are."""
+    """Return the message for a folder without storage files: what is missing, or where bags are.
+
+    Raises
+    ------
+    InputError
+        If the folder is a saved result.
+    """
     missing = missing_files(folder).n_messages
     if missing:
         return (
@@ -167,8 +173,7 @@ def _no_files(folder: Path) -> str:
             f"{_listing(missing)}, and no such file is there; copy the whole "
             "bag"
         )
-    if (folder / FILE_NAME).is_file():
-        return f"{folder} is a saved result, not a bag: hand_eye_calib info {folder}"
+    refuse_saved_result(folder)
     advice = "check the path"
     for subfolder in sorted(
         file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]

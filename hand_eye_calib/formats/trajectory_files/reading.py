@@ -26,6 +26,7 @@ from hand_eye_calib.core.base.text import (
 )
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.formats.files import local_path
+from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.trajectory_files.file_options import (
     AUTO,
     FileOptions,
@@ -173,6 +174,7 @@ def _refuse_misplaced_options(
     ``path`` is the text file to read, or None for an object.
     """
     if path and path.is_dir():
+        refuse_saved_result(path)
         raise ConfigError(
             f"{path} is a folder: name the topic of the bag, such as topic='/odom'"
         )

@@ -15,6 +15,7 @@ from hand_eye_calib.formats.files import (
     read_bytes,
     read_text,
 )
+from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.trajectory_files.cells import are_whole
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -74,6 +75,12 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
     InputError
         If the file or one of its lines cannot be read, or if its columns have no names.
     """
+    refuse_saved_result(Path(path))
+    if Path(path).is_dir():
+        raise InputError(
+            f"{path} is a folder: pass a trajectory file; a bag is calibrated alone, with its "
+            "topics"
+        )
     data = read_bytes(path)
     for read in FILE_READERS.values():
         table: Table | None = read(path, data, options)

@@ -146,6 +146,10 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     if is_batch and (arguments.paths or arguments.list):
         raise ConfigError("--batch cannot be combined with PATH or --list")
+    labels = [name for name, _ in arguments.label]
+    for name in labels:
+        if labels.count(name) > 1:
+            raise ConfigError(f"--label {name} was given twice; keep one")
     # A pattern in quotes is not expanded by the shell, and a pattern in a URL never.
     if any("*" in str(path) for path in arguments.paths):
         from hand_eye_calib.formats.bags.patterns import matching

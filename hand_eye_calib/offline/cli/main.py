@@ -196,6 +196,7 @@ def _run(argv: Sequence[str]) -> int:
         module = COMMANDS[command].load()
         parsers[command].description = COMMANDS[command].help
         module.add_arguments(parsers[command])
+        _refuse_repeated(parsers[command], argv)
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
         if message := misplaced(arguments.command, rest):
@@ -310,6 +311,34 @@ def _commands_with(option: str) -> dict[str, argparse.ArgumentParser]:
             if is_own and option in line.replace(",", " ").split():
                 typical[name] = parser
     return typical or owners
+
+
+def _refuse_repeated(
+    parser: argparse.ArgumentParser, words: Sequence[str]
+) -> None:
+    """Exit with an error if an option that takes a value is given twice.
+
+    argparse would keep the last value and ignore the others. ``--prior`` may be repeated, once for
+    each axis; so may options that collect their values, such as ``--label``.
+    """
+    actions = parser._option_string_actions
+    names = []
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == "--":
+            break
+        option, equals, value = word.partition("=")
+        action = actions.get(option)
+        is_single = action is not None and action.nargs != 0
+        if not is_single or isinstance(action, argparse._ExtendAction):
+            continue
+        name = option
+        if option == "--prior":
+            axis, _, _ = (value if equals else following).partition("=")
+            name = f"{option} {axis}"
+        names.append(name)
+    for name in names:
+        if names.count(name) > 1:
+            parser.error(f"{name} was given twice; keep one")
 
 
 def _option_of(

@@ -403,17 +403,8 @@ def options_from(arguments: argparse.Namespace) -> Options:
     Raises
     ------
     ConfigError
-        If the file has an unknown option or a bad value, or an axis has two priors.
+        If the file has an unknown option or a bad value.
     """
-    priors = [
-        name for name, _ in arguments.options if name.startswith("prior.")
-    ]
-    for name in priors:
-        if priors.count(name) > 1:
-            axis = name.removeprefix("prior.")
-            raise ConfigError(
-                f"--prior {axis} is given twice; keep one value of {axis}"
-            )
     file_options = _read_config(arguments.config) if arguments.config else {}
     return {**file_options, **dict(arguments.options)}
 

@@ -8,18 +8,13 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import AXIS_UNITS, shown_value
-from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
-from hand_eye_calib.formats.files import open_regular
-from hand_eye_calib.offline.cli.options import argument_type
-
-# Line that only the file of a result has.
-_LINE_OF_RESULT = re.compile(
-    rb"^format: hand_eye_calib/extrinsic\s*$", re.MULTILINE
+from hand_eye_calib.formats.saved_results import (
+    is_saved_result,
+    refuse_saved_result,
 )
-# The line is among the first bytes of the file.
-_BEGINNING = 4096
+from hand_eye_calib.offline.cli.options import argument_type
 
 
 def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
@@ -42,11 +37,8 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
                 f"{len(names)} files in one argument: leave out the quotes and commas: "
                 f"{shlex.join(names)}"
             )
-        if isinstance(path, Path) and _is_result(path):
-            raise InputError(
-                f"{path} is a saved result: show it with hand_eye_calib info "
-                f"{shlex.quote(str(path))}, or pass the streams again"
-            )
+        if isinstance(path, Path):
+            refuse_saved_result(path)
     if (
         command == "replay"
         and len(paths) > 1
@@ -66,7 +58,7 @@ def calibrating(words: Sequence[str]) -> str:
     first = Path(words[0])
     if not first.exists():
         return ""
-    command = "info" if _is_result(first) else "calibrate"
+    command = "info" if is_saved_result(first) else "calibrate"
     return f"hand_eye_calib {command} {shlex.join(words)}"
 
 
@@ -93,21 +85,3 @@ def directory(text: str) -> Path:
             f"the name is empty, got {shown_value(text)}: name a directory"
         )
     return Path(text)
-
-
-def _is_result(path: Path) -> bool:
-    """Return whether a path is a saved result: its file, or its folder without a recording."""
-    if path.is_dir():
-        # These modules load numpy, which the start of a command does not need.
-        from hand_eye_calib.formats.journal import has_session
-        from hand_eye_calib.formats.results import FILE_NAME
-
-        if not (path / FILE_NAME).is_file():
-            return False
-        # A session writes its result beside its journal and its recording.
-        has_journal = any(map(has_session, [path, *path.iterdir()]))
-        return not (has_journal or any(map(has_suffix_of_bag, path.rglob("*"))))
-    if path.suffix not in (".yaml", ".yml") or not path.is_file():
-        return False
-    with open_regular(path) as file:
-        return bool(_LINE_OF_RESULT.search(file.read(_BEGINNING)))
