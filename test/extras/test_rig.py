@@ -10,13 +10,14 @@ from result_making import written_finding
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
+from hand_eye_calib.core.checks.findings import finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.extras.rig import command
 from hand_eye_calib.extras.rig import rig as of_rig
 from hand_eye_calib.extras.rig.command import as_lines
 from hand_eye_calib.extras.rig.page import render_rig
-from hand_eye_calib.extras.rig.rig import RigCalibration
+from hand_eye_calib.extras.rig.rig import RigCalibration, advice_for_pair
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import save_rig
 from hand_eye_calib.offline.cli import present
@@ -187,6 +188,30 @@ def test_copies_of_a_sensor_other_than_the_first_are_not_used(rig, mounted):
     assert calibrated.headline == (
         "DO NOT USE: front and copy of 4 sensors; USE: rear"
     )
+
+
+def test_sensors_called_exact_are_no_copies_and_have_less_allowance(
+    rig, calibrated
+):
+    trajectories = trajectories_of(rig)
+    copy = trajectories["front"].poses @ se3.exp(np.full(6, 0.2))
+    trajectories["rear"] = hec.Trajectory(trajectories["front"].stamps_ns, copy)
+    exact = hec.calibrate_rig(
+        trajectories, {"parent_kind": "exact", "child_kind": "exact"}
+    )
+    # Copies are never used without these options, as the test above shows.
+    assert exact.verdict is hec.Verdict.USE_WITH_CARE
+    assert (
+        exact.calibrations[0].allowance < calibrated.calibrations[0].allowance
+    ).all()
+
+
+def test_advice_that_a_rig_refuses_names_the_two_sensors(calibrated):
+    result = calibrated.calibrations[0]
+    assert advice_for_pair(result) == ""
+    inverse = finding("inverse", "child", options={"child_invert": "poses"})
+    bad = dataclasses.replace(result, findings=(inverse,))
+    assert advice_for_pair(bad).endswith("calibrate lidar and front alone")
 
 
 def test_what_is_of_two_sensors_is_refused(rig):

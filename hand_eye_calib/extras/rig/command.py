@@ -163,12 +163,15 @@ def as_lines(rig: "RigCalibration", with_details: bool = False) -> list[str]:
 
     With details, the quaternion and a summary of each result are added.
     """
+    from hand_eye_calib.extras.rig.rig import advice_for_pair
+
     lines = [rig.headline, ""]
     for calibration in rig.calibrations:
         first, *others = verdict_lines(calibration)
         lines += [
             f"{calibration.child_frame} in {calibration.parent_frame}: {first}",
             *others,
+            *wrapped(advice_for_pair(calibration), "  -> ", "     "),
         ]
         transform = transforms_of(calibration)["T_parent_child"]
         lines += transform_lines(

@@ -7,7 +7,12 @@ from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.engine.session_result import SessionResult
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.results.document import printed_numbers, transforms_of
-from hand_eye_calib.extras.rig.rig import RigCalibration, calibrate_rig
+from hand_eye_calib.extras.rig.rig import (
+    KINDS,
+    RigCalibration,
+    advice_for_pair,
+    calibrate_rig,
+)
 from hand_eye_calib.formats.results import save_rig
 from hand_eye_calib.offline.cli.reporting import write_page
 from hand_eye_calib.offline.report.report import TONES, page, pictures_of_extras
@@ -56,6 +61,7 @@ def render_rig(
         "",
         interface,
         rig=rig,
+        advice_for_pair=advice_for_pair,
         inputs=inputs,
         poses=[
             printed_numbers(
@@ -77,6 +83,7 @@ def write_session_rig(directory: Path, session: SessionResult) -> None:
     parent, child = session.snapshot.streams
     # Options that apply to all sensors.
     names = ["method", "max_gap", "target.translation", "target.rotation"]
+    names += KINDS
     if isinstance(config.time_offset, str):
         names.append("time_offset")
     else:

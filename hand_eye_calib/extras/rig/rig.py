@@ -41,6 +41,8 @@ from hand_eye_calib.core.results.records import Finding, gravest_first
 
 # Beginnings of the names of options that a rig does not have, because they concern two sensors.
 _OF_ONE_PAIR = ("parent_", "child_", "base_frame", "prior")
+#: Options of two sensors that a rig has: the kind of the first sensor, and that of all others.
+KINDS = ("parent_kind", "child_kind")
 
 
 def calibrate_rig(
@@ -63,7 +65,8 @@ def calibrate_rig(
         Poses of each sensor in its own world, by the name of its frame; at least three.
     options : mapping of str to value, optional
         Options by their public names, such as method, max_gap or target.translation; see
-        :class:`~hand_eye_calib.core.base.config.CalibratorConfig`.
+        :class:`~hand_eye_calib.core.base.config.CalibratorConfig`. ``parent_kind`` is the kind of
+        the first sensor, ``child_kind`` that of all others.
     time_offset, scale : str, optional
         "estimate"; for the scale also "auto" or "none". The option applies to each sensor relative
         to the first sensor.
@@ -113,9 +116,9 @@ def calibrated(
         _aligned(other, attempt)
         for other, attempt in zip(others, attempts, strict=True)
     ]
-    max_gap_s = attempts[0].snapshot.config.max_gap
+    config = attempts[0].snapshot.config
     neighbours = [
-        _between(parent, child, calibration.method, max_gap_s)
+        _between(parent, child, calibration.method, config)
         for calibration, parent, child in zip(
             star, aligned, aligned[1:], strict=False
         )
@@ -124,7 +127,7 @@ def calibrated(
         first.sensor_frame,
         *(calibration.child_frame for calibration in star),
     )
-    star = _with_copies(star, others, aligned, max_gap_s)
+    star = _with_copies(star, others, aligned, config)
     return RigCalibration.of(sensors, star, neighbours)
 
 
@@ -132,7 +135,7 @@ def _with_copies(
     star: Sequence[Calibration],
     others: Sequence[Trajectory],
     aligned: Sequence[Trajectory],
-    max_gap_s: float,
+    config: CalibratorConfig,
 ) -> list[Calibration]:
     """Return the results with a finding in both results of two sensors that are copies.
 
@@ -145,8 +148,9 @@ def _with_copies(
         Each other sensor in the frame of the first sensor.
     others, aligned : sequence of Trajectory
         The other sensors' streams as recorded, and on the clock of the first sensor.
-    max_gap_s : float
-        Longest interval between two poses that is interpolated, s.
+    config : CalibratorConfig
+        Options of the first result: the longest interval that is interpolated, and the kind of the
+        other sensors.
     """
     results = list(star)
     for i, k in combinations(range(len(star)), 2):
@@ -154,9 +158,9 @@ def _with_copies(
             # Streams with another fault differ by this fault, or have their finding already.
             continue
         copied = independence.check_copies(
-            StreamPair(others[i], others[k], max_gap_s),
-            StreamPair(aligned[i], aligned[k], max_gap_s),
-            are_exact=False,
+            StreamPair(others[i], others[k], config.max_gap),
+            StreamPair(aligned[i], aligned[k], config.max_gap),
+            are_exact=config.child_kind == "exact",
         )
         for found in copied:
             names = {
@@ -188,12 +192,20 @@ def _aligned(child: Trajectory, attempt: Attempt) -> Trajectory:
 
 
 def _between(
-    parent: Trajectory, child: Trajectory, method: str, max_gap_s: float
+    parent: Trajectory, child: Trajectory, method: str, config: CalibratorConfig
 ) -> Calibration:
-    """Calibrate two neighbours in the list, which already have the same clock and unit."""
-    pairs = synchronise(parent, child, max_gap_s)
-    config = CalibratorConfig(method=method, max_pairs=max(len(pairs), 10))
-    calibration = solve_poses(pairs, config).calibration()
+    """Calibrate two neighbours in the list, which already have the same clock and unit.
+
+    ``config`` has the options of the first result. Both neighbours are of the kind ``child_kind``.
+    """
+    pairs = synchronise(parent, child, config.max_gap)
+    of_neighbours = CalibratorConfig(
+        method=method,
+        max_pairs=max(len(pairs), 10),
+        parent_kind=config.child_kind,
+        child_kind=config.child_kind,
+    )
+    calibration = solve_poses(pairs, of_neighbours).calibration()
     return replace(
         calibration,
         parent_frame=parent.sensor_frame,
@@ -220,9 +232,10 @@ def _require_rig(
                 "poses: calibrate this sensor with one of the others"
             )
     for name, value in options.items():
-        if name.startswith(_OF_ONE_PAIR):
+        if _is_of_one_pair(name):
             raise ConfigError(
-                f"{name} applies to two sensors; omit it for a rig"
+                f"{name} applies to two sensors; omit it for a rig, or calibrate the first sensor "
+                "with one of the others"
             )
         if name in ("time_offset", "scale") and not isinstance(value, str):
             raise ConfigError(
@@ -291,6 +304,25 @@ class Closure:
             chi2=self.chi2,
             dof=self.dof,
         )
+
+
+def advice_for_pair(calibration: Calibration) -> str:
+    """Return the advice to calibrate two sensors alone; empty without need.
+
+    Other advice on the result may name options of two sensors, which a rig does not have.
+    """
+    names = [name for reason in calibration.reasons for name in reason.options]
+    if not any(map(_is_of_one_pair, names)):
+        return ""
+    return (
+        f"these options are for two sensors: calibrate {calibration.parent_frame} and "
+        f"{calibration.child_frame} alone"
+    )
+
+
+def _is_of_one_pair(option: str) -> bool:
+    """Return whether only two sensors have an option, a rig not."""
+    return option.startswith(_OF_ONE_PAIR) and option not in KINDS
 
 
 @dataclass(frozen=True)

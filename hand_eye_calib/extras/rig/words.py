@@ -15,7 +15,9 @@ WORDS = {
     "copied_in_rig": FindingWords(
         "{first} and {second}: {evidence}. Was one computed from the other (TF, fusion, a copy of "
         "the file)? Then the rig has a sensor less",
-        "give the poses that both sensors measured by themselves, or omit {first} or {second}",
+        "give the poses that both sensors measured by themselves, or omit {first} or {second}; if "
+        "they are exact (motion capture, surveyed, simulated), give child_kind exact, and "
+        "parent_kind exact if the first sensor is, too",
         severity=Severity.WARNING,
         code="not_independent",
     ),
