@@ -293,6 +293,33 @@ def test_good_streams_are_left_alone(streams):
 
 
 @pytest.mark.parametrize(
+    ("offset_s", "factor", "is_inverse", "estimate"),
+    [
+        (0.3, 1.0, False, "0.30"),
+        (0.0, 1.7, False, "0.588"),
+        (0.0, 1.0, True, "USE"),
+    ],
+)
+def test_a_session_keeps_messages_without_estimates_and_verdicts(
+    streams, offset_s, factor, is_inverse, estimate
+):
+    parent, child, _ = streams
+    child = child.shifted(offset_s).scaled(factor)
+    if is_inverse:
+        child = replace(child, poses=se3.inverse(child.poses))
+    snapshot = whole_snapshot(parent, child, {"reference": "B5"})
+    attempt = review(snapshot.estimate(), snapshot)
+    (message,) = attempt.messages
+    assert estimate in message.text
+    assert message.text in attempt.calibration.warnings
+    assert estimate not in message.lasting
+    assert attempt.for_session().warnings[0] == message.lasting
+    for name, value in attempt.options.items():
+        assert f"{name} {value}" in message.lasting
+    assert message.text not in attempt.for_session().warnings
+
+
+@pytest.mark.parametrize(
     ("is_inverse", "offset_s", "factor", "n_expected"),
     [
         (False, 0.0, 1.0, 1),

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import defaults_of
 from hand_eye_calib.core.base.option import Options
@@ -26,6 +27,22 @@ STREAM_REPAIRS = (
 _MAX_MISFIT = 2.0
 
 
+class OptionMessage(NamedTuple):
+    """Message about options that were set automatically.
+
+    Attributes
+    ----------
+    text : str
+        Message with the estimates of the result.
+    lasting : str
+        Message without estimates and verdict. A live session keeps it, because later results with
+        the same options have other estimates.
+    """
+
+    text: str
+    lasting: str
+
+
 @dataclass(frozen=True)
 class Attempt:
     """Result of a snapshot that was solved and checked.
@@ -40,7 +57,7 @@ class Attempt:
         Check of the streams with the result.
     options : mapping
         Options that were set automatically, because a check is certain of them: name to value.
-    messages : tuple of str
+    messages : tuple of OptionMessage
         Messages about these options and the reason. They are the first warnings of the calibration.
     """
 
@@ -48,7 +65,7 @@ class Attempt:
     snapshot: Snapshot
     check: CheckResult = field(default_factory=lambda: CheckResult(()))
     options: Options = field(default_factory=dict)
-    messages: tuple[str, ...] = ()
+    messages: tuple[OptionMessage, ...] = ()
 
     @property
     def is_usable(self) -> bool:
@@ -108,10 +125,11 @@ class Attempt:
         )
 
     def with_messages(
-        self, options: Options, messages: Collection[str]
+        self, options: Options, messages: Collection[OptionMessage]
     ) -> "Attempt":
         """Return the attempt with options that were set automatically, and warnings about them."""
-        warnings = tuple(dict.fromkeys((*messages, *self.calibration.warnings)))
+        texts = [message.text for message in messages]
+        warnings = tuple(dict.fromkeys((*texts, *self.calibration.warnings)))
         calibration = replace(self.calibration, warnings=warnings)
         return replace(
             self,
@@ -119,6 +137,15 @@ class Attempt:
             options=dict(options),
             messages=tuple(messages),
         )
+
+    def for_session(self) -> Calibration:
+        """Return the result with lasting messages in place of messages with estimates."""
+        texts = [message.text for message in self.messages]
+        lasting = [message.lasting for message in self.messages]
+        others = [
+            text for text in self.calibration.warnings if text not in texts
+        ]
+        return replace(self.calibration, warnings=(*lasting, *others))
 
 
 def with_options(snapshot: Snapshot, options: Options) -> Snapshot:

@@ -45,6 +45,7 @@ from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import (
     STREAM_REPAIRS,
     Attempt,
+    OptionMessage,
     with_options,
 )
 from hand_eye_calib.core.engine.kinds import kind_of
@@ -70,6 +71,12 @@ Progress: TypeAlias = Callable[[float, str], None]
 _CHECKS_BEGIN = 0.8
 
 _ESTIMATED_CLOCK: Options = {"time_offset": "estimate"}
+
+# Reasons to estimate an option, without the estimate.
+_REASONS_TO_ESTIMATE = {
+    "time_offset": "the clocks may differ",
+    "scale": "the lengths may differ",
+}
 
 # Codes of findings, besides those about conventions, that are certain enough for a second solve.
 _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
@@ -143,7 +150,8 @@ def run(
     else:
         best = _solved_and_checked(snapshot, checks, report)
         if note := note_on_unit(snapshot):
-            best = best.with_messages(best.options, (note, *best.messages))
+            messages = [OptionMessage(note, note), *best.messages]
+            best = best.with_messages(best.options, messages)
     report(1.0, "done")
     return best
 
@@ -399,10 +407,13 @@ def _repaired(
     if any(map(_contradicts_repair, second.check.findings)):
         return None
     verdict = second.calibration.verdict.value
-    message = repair_message(
-        [finding for finding in findings if {*finding.options} & {*options}],
-        options,
-        f": {verdict}; as the streams are: {verdict_as_given}",
+    verdicts = f": {verdict}; as the streams are: {verdict_as_given}"
+    faults = [
+        finding for finding in findings if {*finding.options} & {*options}
+    ]
+    message = OptionMessage(
+        repair_message(faults, options, verdicts),
+        repair_message(faults, options),
     )
     second = second.with_messages(
         {**options, **second.options}, (message, *second.messages)
@@ -511,12 +522,17 @@ def _with_estimate_warnings(
     rate = calibration.clock_rate
     if rate and rate.is_used:
         reasons["time_offset"] += f" and {rate}"
-    defaults = defaults_of(options)
-    messages = [
-        f"{reasons[name]}: solved with {name} {value}; to keep the stream unchanged, set {name} "
-        f"{defaults[name]}"
-        for name, value in options.items()
-    ]
+    messages = []
+    for name, value in options.items():
+        solved = (
+            f"solved with {name} {value}; to keep the stream unchanged, set {name} "
+            f"{defaults_of([name])[name]}"
+        )
+        is_estimate = value == "estimate"
+        lasting = _REASONS_TO_ESTIMATE[name] if is_estimate else reasons[name]
+        messages.append(
+            OptionMessage(f"{reasons[name]}: {solved}", f"{lasting}: {solved}")
+        )
     return _with_offset_doubt(attempt.with_messages(options, messages), [])
 
 

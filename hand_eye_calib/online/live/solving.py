@@ -46,9 +46,6 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.state import GRACE_S
 from hand_eye_calib.online.live.stream_checks import merged
 
-# Middle of the message that the time offset is estimated: an estimate is before it.
-_SOLVED_WITH_OFFSET = ": solved with time_offset estimate"
-
 # Code of the process. With `python -m`, the classes of its answers would belong to the module
 # __main__, and the node could not unpickle them.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
@@ -220,26 +217,15 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
         return replace(
             result,
             check=run.check,
-            messages=run.messages,
             calibration=calibration,
         )
-    warnings = tuple(map(_without_first_offset, run.calibration.warnings))
     return replace(
         result,
         check=run.check,
         options=dict(run.options),
-        messages=tuple(map(_without_first_offset, run.messages)),
-        calibration=replace(run.calibration, warnings=warnings),
+        messages=tuple(message.lasting for message in run.messages),
+        calibration=run.for_session(),
     )
-
-
-def _without_first_offset(message: str) -> str:
-    """Return a message about an option without the first estimate of the time offset.
-
-    The session keeps the message, whereas later results have other estimates.
-    """
-    _, solved, rest = message.partition(_SOLVED_WITH_OFFSET)
-    return f"the clocks may differ{solved}{rest}" if solved else message
 
 
 def with_findings_before_pairing(
