@@ -361,7 +361,7 @@ def test_several_axes_and_targets_are_named_together():
 def scaled(severity):
     text = (
         "the child's lengths are 2.1 +/- 0.1 % longer than the "
-        "parent's; the result allows for it"
+        "parent's; this result corrects them"
     )
     return written_finding("model_scale", severity, text)
 

@@ -367,9 +367,10 @@ def test_stops_that_were_left_out_are_counted_and_named(
     (finding,) = result.findings
     assert (finding.code, finding.severity) == ("outliers", severity)
     assert finding.evidence == {"count": count, "n_stops": 40}
-    text = f"{count} of 40 stops clearly do not fit the others and were left out: stop"
+    assert sum(not row.is_used for row in result.stops.rows) == count
+    text = f"{count} of 40 stops do not fit the others and were left out: stop"
     if count == 1:
-        text = "1 of 40 stops clearly does not fit the others and was left out: stop"
+        text = "1 of 40 stops does not fit the others and was left out: stop"
     assert text in result.headline
     assert result.verdict is verdict
     error = se3.log(se3.inverse(result.T_parent_child) @ truth)

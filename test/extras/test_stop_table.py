@@ -122,9 +122,11 @@ def test_details_and_report_have_residuals_and_views(tmp_path, capsys):
 
     out = " ".join(capsys.readouterr().out.split())
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "residuals of the stops (left out: weight 0): 1: " in out
+    assert "residuals of the stops; 0 of 20 left out (weight 0): 1: " in out
     assert "record 3 more stops from stop" in out
     assert "record 3 more stops from stop" in page
+    assert 'href="#stops"' in page
+    assert "Samples, findings, solution, covariance" in page
     assert "Pose of target in base" in page
     assert 'id="figure-stops"' in page
     assert page.count('<tr><th scope="row" class="number">') == 20

@@ -316,7 +316,7 @@ WORDS = {
         "those of the other sensor by a wrong transform",
     ),
     "model_scale": FindingWords(
-        "the child's lengths are {size} % {than} than the parent's; the result allows for it",
+        "the child's lengths are {size} % {than} than the parent's; this result corrects them",
         "find out which of the two measures wrongly; if you do not trust either, have the scale "
         "estimated (scale estimate)",
         "a wheel radius, a camera's baseline or a map that is stretched",

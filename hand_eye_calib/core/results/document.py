@@ -267,10 +267,10 @@ def matrix_of(of: str, frame: str, matrix: FloatArray) -> Document:
 
 
 def _inliers_in_words(result: Result) -> dict[str, str]:
-    """Return the number of inliers as text, with its name: motion pairs, or stops of an arm."""
-    counts = f"{result.n_inliers:,} of {result.n_pairs:,}"
+    """Return the number of inliers as text, with its name; empty for stops, which have a table."""
     if result.reference == "stops":
-        return {"Stops": f"{counts} have more than half of the full weight"}
+        return {}
+    counts = f"{result.n_inliers:,} of {result.n_pairs:,}"
     return {"Motion pairs": f"{counts} are inliers"}
 
 
@@ -389,7 +389,7 @@ def angles_in_words(transform: Notation, result: Result) -> str:
     # Angles that are printed to the digits of the rotation need no explanation.
     excess_deg = float(sigmas_deg[are_known].max()) - math.degrees(rotation_rad)
     if not round(excess_deg, 1) > 0.0:
-        return _about_axes_in_words(transform, are_known)
+        return _about_axes_in_words(transform, are_known, result)
     if not np.isfinite(transform.rpy_deg).all():
         return ""
     return (
@@ -398,7 +398,27 @@ def angles_in_words(transform: Notation, result: Result) -> str:
     )
 
 
-def _about_axes_in_words(transform: Notation, are_known: BoolArray) -> str:
+def _differs_from_headline(transform: Notation, result: Result) -> bool:
+    """Return whether the headline has another rotation sigma than the angles of a transform.
+
+    The headline has the largest standard deviation about the parent's axes. Other transforms have
+    other axes, so they are not compared.
+    """
+    about_rad = np.radians(transform.sigma_about_deg)
+    angles_rad = np.radians(transform.sigma_rpy_deg)
+    are_of_headline = np.allclose(about_rad, result.sigmas[3:], equal_nan=True)
+    if not are_of_headline or not np.isfinite([about_rad, angles_rad]).all():
+        return False
+    printed = [
+        amount("roll", float(sigmas.max()))
+        for sigmas in (about_rad, angles_rad)
+    ]
+    return printed[0] != printed[1]
+
+
+def _about_axes_in_words(
+    transform: Notation, are_known: BoolArray, result: Result
+) -> str:
     """Return the standard deviations about x, y and z if those of the angles differ from them.
 
     ``are_known`` (3,) says which axes are determined; the others are left out.
@@ -410,7 +430,8 @@ def _about_axes_in_words(transform: Notation, are_known: BoolArray) -> str:
     )
     if not len(ratios) or not np.isfinite(ratios).all():
         return ""
-    if np.abs(np.log(ratios)).max() < _SAME_ANGLES:
+    is_same = np.abs(np.log(ratios)).max() < _SAME_ANGLES
+    if is_same and not _differs_from_headline(transform, result):
         return ""
     axes = np.array(TRANSLATIONS)[are_known].tolist()
     sizes = [

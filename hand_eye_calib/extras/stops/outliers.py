@@ -3,15 +3,15 @@
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.text import counted, listing
+from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
 from hand_eye_calib.extras.stops.robot_world import RobotWorld
 
-# Squared Mahalanobis distance (six values) of a stop above which an outlier is reported. Outliers
-# below it are only counted: errors of a target's pose differ by some times between views.
+# Squared Mahalanobis distance (six values) of a stop above which an outlier is clear. There is no
+# finding without a clear outlier: errors of a target's pose differ by some times between views.
 # Measured on simulated images of three targets.
 _MIN_REPORTED_SQUARED = 225.0
 
@@ -23,22 +23,20 @@ _MAX_LISTED = 8
 
 
 def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
-    """Return a finding with the numbers (from 1) of the stops that are clear outliers, if any."""
-    distances = _squared_distances(fit, stops)
-    is_clear = (fit.weights == 0.0) & (distances > _MIN_REPORTED_SQUARED)
-    numbers = [str(row + 1) for row in np.flatnonzero(is_clear)]
-    count = len(numbers)
-    if count == 0:
+    """Return a finding with the numbers (from 1) of the stops with weight 0, if one is clear.
+
+    The count is that of all stops with weight 0. Only clear outliers decide about the severity.
+    """
+    is_left_out = fit.weights == 0.0
+    is_clear = _squared_distances(fit, stops) > _MIN_REPORTED_SQUARED
+    n_clear = int(np.sum(is_left_out & is_clear))
+    if n_clear == 0:
         return []
+    numbers = [str(row + 1) for row in np.flatnonzero(is_left_out)]
+    count = len(numbers)
     if count > _MAX_LISTED:
         numbers = [*numbers[:_MAX_LISTED], f"{count - _MAX_LISTED} more"]
-    is_large = count > _MAX_LEFT_OUT * len(stops)
-    n_smaller = int(np.sum(fit.weights == 0.0)) - count
-    smaller = ""
-    if n_smaller:
-        smaller = (
-            f" (and {counted(n_smaller, 'smaller outlier')}, see the residuals)"
-        )
+    is_large = n_clear > _MAX_LEFT_OUT * len(stops)
     return [
         finding(
             "outlier_stops",
@@ -48,7 +46,6 @@ def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
             numbers=f"{'stop' if count == 1 else 'stops'} {listing(numbers)}",
             do="does" if count == 1 else "do",
             were="was" if count == 1 else "were",
-            smaller=smaller,
         )
     ]
 

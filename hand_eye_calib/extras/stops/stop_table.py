@@ -105,9 +105,12 @@ class StopsPart(Part):
         return value.advice
 
     def facts(self, value: StopTable, result: Any) -> list[str]:
-        """Return a line with the residual of each stop."""
+        """Return a line with the residual of each stop, and the number of outliers."""
         rows = "; ".join(map(_row_in_words, value.rows))
-        return [f"residuals of the stops (left out: weight 0): {rows}"]
+        n_out = sum(not row.is_used for row in value.rows)
+        return [
+            f"residuals of the stops; {n_out} of {len(value.rows)} left out (weight 0): {rows}"
+        ]
 
 
 def _row_in_words(row: Stop) -> str:

@@ -75,8 +75,7 @@ WORDS = {
         code="same_frame",
     ),
     "outlier_stops": FindingWords(
-        "{count} of {n_stops} stops clearly {do} not fit the others and {were} left out: {numbers}"
-        "{smaller}",
+        "{count} of {n_stops} stops {do} not fit the others and {were} left out: {numbers}",
         "look at these stops: is the target detected well, and does the arm rest?",
         "a target that was detected mirrored, or a stop during a motion",
         severity=Severity.WARNING,

@@ -308,11 +308,21 @@ def _clock_and_scale_lines(
     child = calibration.child_frame
     if sigma_s := calibration.time_offset_sigma_s:
         offset = with_sigma(calibration.time_offset_s, sigma_s, 4)
-        lines.append(f"time offset {offset} s: add it to the stamps of {child}")
+        lines += wrapped(
+            f"time offset {offset} s: applied here; other programs must add it to the stamps of "
+            f"{child}",
+            "",
+            "  ",
+        )
     is_far = abs(calibration.scale - 1.0) > LIMITS["model_scale"].note
     if calibration.scale_sigma and (is_far or is_scale_free):
         scale = with_sigma(calibration.scale, calibration.scale_sigma, 4)
-        lines.append(f"scale {scale}: multiply the lengths of {child} by it")
+        lines += wrapped(
+            f"scale {scale}: applied here; other programs must multiply the lengths of {child} by "
+            "it",
+            "",
+            "  ",
+        )
     return lines
 
 

@@ -46,6 +46,8 @@ UNITS = {
     "x": (100.0, "translation (cm)"),
     "yaw": (180 / np.pi, "rotation (deg)"),
 }
+# The same for the stops of an arm, whose table has millimetres, too.
+_UNITS_OF_STOPS = {**UNITS, "x": (1000.0, "translation (mm)")}
 
 # Why the rates of both streams must coincide, by the quantity that is drawn.
 _WHY_EQUAL = {
@@ -469,12 +471,17 @@ def _figure_of_residuals(
         del sizes["x"]
     if calibration.measured == "positions":
         del sizes["yaw"]
-    is_out = ~residuals.is_inlier
+    units = UNITS
     if calibration.reference == "stops":
+        units = _UNITS_OF_STOPS
+        is_out = residuals.weights == 0.0
+        name_of_outlier = "left out"
         items = "stops"
         times = np.arange(1.0, len(residuals) + 1)
         label = "stop"
     else:
+        is_out = ~residuals.is_inlier
+        name_of_outlier = "outlier"
         items = "motion pairs"
         if calibration.measured == "positions":
             items = "distances from one position to the next"
@@ -487,11 +494,10 @@ def _figure_of_residuals(
         0.9 + 1.6 * len(sizes), len(sizes), 1, sharex=True
     )
     for panel, (axis, values) in zip(panels, sizes.items(), strict=True):
-        to_unit, unit_label = UNITS[axis]
+        to_unit, unit_label = units[axis]
         # A logarithmic axis needs positive values.
-        _draw_residuals(
-            panel, times, np.maximum(values * to_unit, 1e-5), is_out
-        )
+        shown = np.maximum(values * to_unit, 1e-5)
+        _draw_residuals(panel, times, shown, is_out, name_of_outlier)
         panel.set_ylabel(unit_label)
     panels[-1].set_xlabel(label)
     lines, _ = panels[0].get_legend_handles_labels()
@@ -501,35 +507,38 @@ def _figure_of_residuals(
     largest = [
         amount(axis, float(np.max(values))) for axis, values in sizes.items()
     ]
-    rejected = (
+    n_out = (
         f"{is_out.sum():,} ({share(float(is_out.mean()))})"
         if is_out.any()
         else "None"
     )
+    outliers = "left out" if items == "stops" else "outliers"
     caption = (
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
-        f"of them to {listing(largest)}. {rejected} of them are rejected as outliers."
+        f"of them to {listing(largest)}. {n_out} of them are {outliers}."
     )
     return as_drawn(figure, "residuals", "Residuals", caption, lines)
 
 
 def _draw_residuals(
-    panel: Axes, times: FloatArray, values: FloatArray, is_out: BoolArray
+    panel: Axes,
+    times: FloatArray,
+    values: FloatArray,
+    is_out: BoolArray,
+    name_of_outlier: str,
 ) -> None:
-    """Draw the sizes (K,) of residuals, all positive, and mark the rejected residuals.
+    """Draw the sizes (K,) of residuals, all positive, and mark the outliers.
 
-    If there are too many, every n-th used residual and the largest rejected residuals are drawn.
+    If there are too many, every n-th used residual and the largest outliers are drawn.
     """
     dots = np.flatnonzero(~is_out)
     crosses = np.flatnonzero(is_out)
     dots = dots[_downsample(len(dots))]
     crosses = crosses[np.argsort(-values[crosses])[: LOOK.max_points]]
     used = (times[dots], values[dots], "o")
-    rejected = (times[crosses], values[crosses], "x")
+    marked = (times[crosses], values[crosses], "x")
     panel.plot(*used, color=PARENT, ms=2.6, mew=0, alpha=0.65, label="used")
-    panel.plot(
-        *rejected, color=BAD, ms=5.5, mew=1.5, label="rejected as outlier"
-    )
+    panel.plot(*marked, color=BAD, ms=5.5, mew=1.5, label=name_of_outlier)
     panel.axhline(
         np.median(values), color=INK, lw=1.0, ls="--", label="median of all"
     )

@@ -1,5 +1,6 @@
 """Write ``report.html``: one self-contained page with the extrinsic, its sigma and the evidence."""
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -74,6 +75,9 @@ _AXIS_NAMES = {
 _DEFAULT_FRAMES = ("parent_sensor", "child_sensor")
 # Names of the figures at the top of the page. All other figures are in the section Evidence.
 _TOP_FIGURES = ("views", "track", "trajectories")
+
+# Space in a command before an option. A line of the page breaks only there.
+_OPTION_BEGINS = re.compile(r" (?=--)")
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEMPLATES = jinja2.Environment(
@@ -193,7 +197,7 @@ def render(
         stops=calibration.parts.get("stops"),
         facts=facts_of(calibration, "stops"),
         advice=_advice(calibration, evidence),
-        command=command,
+        command=_OPTION_BEGINS.split(command) if command else [],
         unknown=text.listing(_numbers_by_hand(calibration)),
         target=_targets(calibration),
         reasons=shown(calibration.reasons),

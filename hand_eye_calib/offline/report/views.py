@@ -34,6 +34,9 @@ from hand_eye_calib.offline.report.style import (
     plain_label,
 )
 
+# Longest name of a sensor that fits into a view, in characters.
+_MAX_NAME = 14
+
 # The three views and their titles. The key has the parent's axes that are drawn to the right and
 # upwards. The title has the axis that points at the reader or away.
 VIEWS = {"xy": "along z", "xz": "along y", "yz": "along x"}
@@ -129,27 +132,44 @@ def draw_views(
         for calibration in calibrations
     ]
     axis_m = LOOK.axis_share * max(*distances, LOOK.min_distance_m)
+    parent = _short_name(calibrations[0].parent_frame, "parent")
+    is_pair = len(calibrations) == 1
+    children = [
+        _short_name(calibration.child_frame, "child" if is_pair else "")
+        for calibration in calibrations
+    ]
     for panel, (axes, title) in zip(panels, titles.items(), strict=True):
         rows = ["xyz".index(axis) for axis in axes]
         _draw_sensor(
             panel,
             np.eye(4)[rows],
-            calibrations[0].parent_frame,
+            parent,
             PARENT,
             axis_m,
             6,
         )
-        for calibration in calibrations:
+        for calibration, child in zip(calibrations, children, strict=True):
             T = calibration.T_parent_child[rows]
             # A dotted line from the parent's origin to the child's.
             panel.plot(
                 *T[:, 3:] * [[0.0, 1.0]], color=MUTED, lw=0.8, ls=":", zorder=1
             )
-            _draw_sensor(panel, T, calibration.child_frame, CHILD, axis_m, -14)
+            _draw_sensor(panel, T, child, CHILD, axis_m, -14)
             _draw_uncertainty(panel, T, calibration, rows)
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)
+
+
+def _short_name(frame: str, role: str) -> str:
+    """Return the name of a sensor in a view: its frame, its role if that is too long for the view.
+
+    Without a role, the middle of a long name is left out.
+    """
+    if len(frame) <= _MAX_NAME:
+        return frame
+    half = _MAX_NAME // 2
+    return role or f"{frame[:half]}…{frame[-half:]}"
 
 
 def _draw_uncertainty(
