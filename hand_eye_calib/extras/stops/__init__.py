@@ -76,7 +76,7 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _are_stops(arguments: Any) -> bool:
-    """Return whether the arguments name stops; raise ConfigError if they contradict."""
+    """Return whether the arguments name stops. Raise ConfigError for contradicting arguments."""
     if arguments.target and arguments.target[0] in "-.0123456789":
         raise ConfigError(
             "--target is a printed target in images, such as charuco:5x7:0.04:0.03:4X4_50; the "
@@ -104,7 +104,7 @@ def _are_stops(arguments: Any) -> bool:
 def _refuse_without_stops(
     arguments: Any, are_stops: bool, has_hand_file: bool
 ) -> None:
-    """Raise ConfigError for an option of an arm, or of the file of its hand, without such input."""
+    """Raise ConfigError if an option of an arm, or of the file of its hand, has no such input."""
     if arguments.setup and not are_stops:
         raise ConfigError(
             "--setup is the place of the camera of an arm: run arm with the samples of an arm, or "

@@ -39,29 +39,31 @@ from hand_eye_calib.extras.stops.stop_table import StopTable, stop_table
 from hand_eye_calib.extras.stops.worlds import SETUPS, Worlds
 from hand_eye_calib.offline.calibrate import prior_fields
 
-# Options that apply to stops, and the first parts of the names of further options that do.
+# Options that apply to stops.
 _OBEYED = {"min_pairs", "parent_frame", "child_frame", "scale", "parent_scale"}
 _OBEYED |= {
     f"{stream}_{name}"
     for stream in ("parent", "child")
     for name in ("invert", "quaternion", "measures")
 }
+# First parts of the names of further options that apply to stops.
 _OBEYED_GROUPS = ("prior_", "target_")
 
 # Options that declare inverse poses.
 _INVERSIONS = {"parent_invert", "child_invert"}
 
-# A mount is the identity if all of its values are below this many standard deviations, or below
-# this limit (m, rad).
+# X and Z are the identity if each value is below this number of standard deviations ...
 _IDENTITY_SIGMAS = 3.0
+# ... or below this limit (m, rad).
 _MIN_IDENTITY = 0.001
 
-# Poses of an arm may be inverse if the sensor or target on the hand is farther from it than this
-# (m), and if its counterpart is nearer to the base than this share of that distance.
+# Poses of an arm may be inverse if the sensor or target on the hand is farther from the hand than
+# this (m) ...
 _MAX_ON_HAND_M = 0.3
+# ... and the other one is nearer to the base than this share of that distance.
 _MAX_BASE_RATIO = 0.5
 
-# An unobservable direction (unit vector of translation and rotation) is one of the rotation if its
+# An unobservable direction, a unit vector of translation and rotation, counts as a rotation if its
 # rotation part is longer than this.
 _ROTATION_PART = 0.5
 
@@ -72,18 +74,18 @@ def calibrate_stops(
     config: CalibratorConfig | None = None,
     **options: Any,
 ) -> Calibration:
-    """Calibrate two sensors from stops: pairs of poses whose order has no meaning.
+    """Calibrate two sensors from stops: pairs of poses in any order.
 
     Parameters
     ----------
     Ts_world_parent, Ts_world_child : array-likes
-        Poses of both sensors, each in its own world: of a hand in the base of a robot, and of the
-        camera on the hand in the frame of a target. Matrices (N, 4, 4), rows (N, 7) of x, y, z, qx,
-        qy, qz, qw, or a pair (R, t) of rotations (N, 3, 3) or rotation vectors (N, 3) and
-        translations (N, 3).
+        Poses of both sensors, each in its own world. For a robot: the hand in the base of the
+        robot, and the camera on the hand in the frame of a target. Matrices (N, 4, 4), rows (N, 7)
+        of x, y, z, qx, qy, qz, qw, or a pair (R, t) of rotations (N, 3, 3) or rotation vectors (N,
+        3) and translations (N, 3).
     config : CalibratorConfig, optional
-        Conventions, units, scale, priors, targets and names of frames. Other options raise if they
-        are set.
+        Options for conventions, units, scale, priors, targets and names of frames. Any other option
+        raises an error if it is set.
     **options
         The same options as keywords of :func:`hand_eye_calib.calibrate`, without ``config``.
 
@@ -97,9 +99,9 @@ def calibrate_stops(
     NotEnoughDataError
         If there are fewer than three stops.
     InputError
-        If the arrays are no poses, or have different lengths.
+        If the arrays are not poses, or have different lengths.
     ConfigError
-        If an option is set that has no meaning for stops.
+        If an option is set that has no effect on stops.
 
     Examples
     --------
@@ -138,10 +140,10 @@ def calibrate_arm(
     setup: str | None = None,
     **options: Any,
 ) -> Calibration:
-    """Calibrate a camera on a robot's hand, or beside the robot with the target on the hand.
+    """Calibrate a camera on a robot's hand, or beside a robot that holds the target.
 
-    Without ``setup`` both places of the camera are tried, and the one that fits is taken. The four
-    arrays of ``cv2.calibrateHandEye`` may be given in the same order:
+    Without ``setup``, both places of the camera are tried, and the likelier place is used. The four
+    arrays of ``cv2.calibrateHandEye`` are accepted in the same order:
     ``calibrate_arm(R_gripper2base, t_gripper2base, R_target2cam, t_target2cam)``.
 
     Parameters
@@ -150,7 +152,7 @@ def calibrate_arm(
         Poses of the hand in the base (parent), and of the target in the camera (child), in the
         forms of :func:`calibrate_stops`. To set options for arrays of OpenCV, use pairs (R, t).
     config : CalibratorConfig, optional
-        As for :func:`calibrate_stops`; so are ``options``.
+        See :func:`calibrate_stops`, also for ``options``.
     names : mapping of str to str, optional
         Names of the frames base, hand, camera, target.
     setup : {"hand", "beside"}, optional
@@ -159,13 +161,13 @@ def calibrate_arm(
     Returns
     -------
     Calibration
-        The camera in the hand, and the target in the base; or the camera in the base, and the
-        target in the hand.
+        Pose of the camera in the hand, and of the target in the base. With the camera beside the
+        robot: pose of the camera in the base, and of the target in the hand.
 
     Raises
     ------
     NotEnoughDataError, InputError, ConfigError
-        As :func:`calibrate_stops`; ConfigError for an unknown setup as well.
+        See :func:`calibrate_stops`. ConfigError also for an unknown setup.
 
     Examples
     --------
@@ -195,8 +197,8 @@ def calibrate_hand_and_camera(
 ) -> Calibration:
     """Calibrate an arm like :func:`calibrate_arm`, from poses of the camera in the target.
 
-    Poses of the target in a camera on the hand look like those of a camera beside the robot. So
-    this place needs the option ``setup``.
+    Poses of the target in a camera on the hand look like poses of a camera beside the robot.
+    Therefore a camera beside the robot needs the option ``setup``.
     """
     config = _checked(config, {})
     poses = _checked_poses(
@@ -213,7 +215,7 @@ def _calibrated_arm(
     named: Mapping[str, str],
     setup: str | None,
 ) -> Calibration:
-    """Return the result of an arm; ``named`` are the frames base, hand, camera and target."""
+    """Return the result of an arm. ``named`` has the frames base, hand, camera and target."""
     solved = solve_checked(poses, config, setup)
     setup_fit = solved.setup_fit
     solved = solved.adding(*_check_setup(setup_fit, setup))
@@ -235,7 +237,7 @@ def _calibrated_arm(
 
 
 def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
-    """Return whether the third and fourth argument are arrays: R_target2cam and t_target2cam."""
+    """Return whether the third and fourth argument are arrays: R_target2cam, t_target2cam."""
     has_options = isinstance(config, CalibratorConfig | None)
     has_names = isinstance(names, Mapping | None)
     return not (has_options or has_names)
@@ -244,14 +246,14 @@ def _are_arrays_of_opencv(config: Any, names: Any) -> bool:
 def _checked(
     config: CalibratorConfig | None, options: Mapping[str, Any]
 ) -> CalibratorConfig:
-    """Return the options of ``config``, those of the keywords, or the default ones.
+    """Return the options in ``config``, the options in keywords, or the default options.
 
     Raises
     ------
     InputError
-        If the options are no CalibratorConfig, such as an array of OpenCV.
+        If the options are not a CalibratorConfig; they may be an array of OpenCV.
     ConfigError
-        If an option is set that has no meaning for stops, or if there are both kinds of options.
+        If an option is set that has no effect on stops, or if both kinds of options are present.
     """
     if config is not None and options:
         raise ConfigError(
@@ -286,7 +288,7 @@ def _checked(
 def _checked_poses(
     sides: Mapping[str, Any], config: CalibratorConfig
 ) -> StopPoses:
-    """Return the poses of parent and child as stacks; ``sides`` are their values by name.
+    """Return the poses of parent and child as stacks. ``sides`` has their values by name.
 
     Positions are zero if only rotations are measured.
     """
@@ -316,7 +318,7 @@ def _checked_poses(
 
 
 def _check_setup(setup_fit: SetupFit, setup: str | None) -> list[Finding]:
-    """Return a finding if both sides of an arm have the same poses, or if both setups fit."""
+    """Return a finding if both sides of an arm have equal poses, or if both setups fit equally."""
     if setup_fit.fit.undetermined().size:
         return []
     if _is_copy(setup_fit.fit):
@@ -327,9 +329,9 @@ def _check_setup(setup_fit: SetupFit, setup: str | None) -> list[Finding]:
 
 
 def _is_copy(fit: RobotWorld) -> bool:
-    """Return whether X and Z are the identity, so that both sides have the same poses.
+    """Return whether X and Z are the identity, which means that both sides have the same poses.
 
-    A real camera and target are not both at the origins of hand and base.
+    With a real arm, camera and target are not both at the origins of hand and base.
     """
     offsets = np.r_[se3.log(fit.T_parent_child), se3.log(fit.T_world_world)]
     sigmas = np.sqrt(np.diag(fit.covariance))
@@ -342,7 +344,7 @@ def _is_copy(fit: RobotWorld) -> bool:
 
 
 def _setup_in_words(setup_fit: SetupFit, config: CalibratorConfig) -> str:
-    """Return the assumed place of the camera as text, with the options for inverse poses."""
+    """Return the assumed place of the camera in words, with the options for inverse poses."""
     place = SETUPS["beside" if setup_fit.is_inverse else "hand"]
     return (
         f"read as a camera {place}; if that is wrong, one side or both have inverse poses: "
@@ -355,8 +357,8 @@ def _check_distances(
 ) -> list[Finding]:
     """Return a finding if distances of camera and target suggest inverse poses.
 
-    They do if the camera or target on the hand is far from the hand, while its counterpart is near
-    the base. ``frames`` has the names of base, hand, camera and target.
+    Inverse poses are likely if the camera or target on the hand is far from the hand, while the
+    other one is near the base. ``frames`` has the names of base, hand, camera and target.
     """
     fit = setup_fit.fit
     if (
@@ -387,9 +389,9 @@ def _check_distances(
 
 
 class _Frames(NamedTuple):
-    """Default names of the frames of both sensors and of their worlds, and the setup of an arm.
+    """Default names of both sensors' frames and of their worlds, and the setup of an arm.
 
-    ``setup`` is "hand" or "beside" for an arm, else empty.
+    ``setup`` is "hand" or "beside" for an arm; empty otherwise.
     """
 
     parent: str
@@ -400,7 +402,7 @@ class _Frames(NamedTuple):
 
 
 def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
-    """Return the frames of an arm; ``names`` are those of base, hand, camera and target."""
+    """Return the frames of an arm. ``names`` has the names of base, hand, camera and target."""
     if is_beside:
         return _Frames(
             names["base"],
@@ -417,7 +419,7 @@ def _frames_of_arm(names: Mapping[str, str], is_beside: bool) -> _Frames:
 def _calibration_of(
     solved: SolvedStops, warnings: Sequence[str], frames: _Frames
 ) -> Calibration:
-    """Return the result: the fit fused with the prior, with residuals, findings and advice."""
+    """Return the result: the fit combined with the prior, with residuals, findings and advice."""
     fit = solved.setup_fit.fit
     stops = solved.setup_fit.stops
     config = solved.config
@@ -473,7 +475,7 @@ def _calibration_of(
 def _with_advice(
     table: StopTable, solved: SolvedStops, frames: _Frames
 ) -> StopTable:
-    """Return the table of stops, with advice on the next stops to record."""
+    """Return the table of stops, with advice about the next stops to record."""
     config = solved.config
     is_beside = frames.setup == "beside"
     hand = config.parent_frame or frames.parent
@@ -489,7 +491,7 @@ def _with_advice(
 
 
 def _without_positions(covariance: FloatArray) -> FloatArray:
-    """Return a covariance (6, 6) with the translation replaced by an unknown one."""
+    """Return a covariance (6, 6) whose translation is replaced by an unknown translation."""
     without = np.diag(UNKNOWN_SIGMAS**2)
     without[3:, 3:] = covariance[3:, 3:]
     return without
@@ -498,7 +500,7 @@ def _without_positions(covariance: FloatArray) -> FloatArray:
 def _with_unknown_positions(unknown: FloatArray) -> FloatArray:
     """Return the unobservable directions (6, K) if only rotations are measured.
 
-    They are the three translations, and the rotations among the directions ``unknown`` (6, K).
+    They are the three translations, and the rotations among the unknown directions (6, K).
     """
     is_rotation = np.linalg.norm(unknown[3:], axis=0) > _ROTATION_PART
     rotations = unknown[3:, is_rotation]

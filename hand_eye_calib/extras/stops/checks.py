@@ -2,10 +2,10 @@
 
 Rotations alone reveal wrong rows and wrong kinds of angles
 (:mod:`hand_eye_calib.extras.stops.rotation_checks`). They do not reveal a wrong order of
-quaternions: w x y z taken for x y z w are the inverse rotations in other axes, which agree, too.
-Then only the positions contradict. So each usual mistake is a hypothesis: the mistake is undone,
-and a rough fit of ``A X = Z B`` measures how well rotations and positions agree. The best
-hypotheses are solved in full and compared by their likelihoods.
+quaternions: if w x y z is read as x y z w, the result is inverse rotations in other axes, which
+agree as well. Only the positions then contradict. Therefore each usual mistake is a hypothesis: the
+mistake is undone, and a rough fit of ``A X = Z B`` measures how well rotations and positions agree.
+The best hypotheses are solved in full and compared by their likelihoods.
 """
 
 import itertools
@@ -49,45 +49,45 @@ from hand_eye_calib.extras.stops.rough_fit import (
     turns_about_two_axes,
 )
 
-# Smallest unexplained share of rotations or positions that is a warning.
+# Smallest unexplained share of rotations or positions that causes a warning.
 _DOUBTFUL_SHARE = 0.12
 
-# Limits of ``RoughFit.position_ratio``: residuals of positions over the errors that errors of the
-# rotations cause. Measured: 1 to 5 for three real arms, 1 to 4 for KinHEC with noise. Above the
-# first limit, noise does not explain the residuals. Above the second limit, positions contradict if
-# more than the third limit of their spread is unexplained.
+# Limits of ``RoughFit.position_ratio``: the residuals of positions, divided by the position errors
+# that errors of the rotations cause. Measured: 1 to 5 for three real arms, 1 to 4 for KinHEC with
+# noise. First limit: noise does not explain larger residuals.
 _MAX_POSITION_RATIO = 4.0
+# Second limit: above it, positions contradict the hypothesis if ...
 _CONTRADICTING_POSITION_RATIO = 12.0
+# ... more than this share of their spread is unexplained.
 _CONTRADICTING_SHARE = 0.08
 
-# Hypotheses whose log likelihoods differ by less than this are equally good: a factor of 1100
-# between the likelihoods. Measured on simulated arms: the log likelihoods of the two setups (camera
-# on the hand, camera beside the arm) differ by at least 95 with four or more stops, and by 0.0 with
-# three.
+# Two hypotheses are equally good if their log likelihoods differ by less than this (a factor of
+# 1100). Measured on simulated arms: the two setups (camera on the hand, camera beside the arm)
+# differ by at least 95 with four or more stops, and by 0.0 with three.
 MIN_LEAD = 7.0
 
-# Largest number of hypotheses that are solved in full: those with the best rough fits.
+# Largest number of hypotheses that are solved in full. They are those with the best rough fits.
 _MAX_RIVALS = 6
 
-# Largest spread (m) of the positions of an arm. A larger spread means that the unit is not metres.
+# Largest spread (m) of an arm's positions. If it is larger, the unit is not metres.
 _MAX_SPREAD_M = 3.0
 
-# Positions whose median distance from the origin is at most this number are in centimetres. Others
-# are in millimetres.
+# Positions are in centimetres if their median distance from the origin is at most this number;
+# otherwise they are in millimetres.
 _MAX_DISTANCE_CM = 200.0
 
-# Largest factor by which the assumed size of a target is wrong. A larger factor between the lengths
-# of both sides is a difference of units.
+# Largest factor by which the assumed size of a target may be wrong. A larger factor between the
+# lengths of both sides is a difference of units.
 _MAX_SIZE_FACTOR = 3.0
 
-# Units of lengths by their factors to metres.
+# Units of length, as factors to metres.
 _CENTIMETRE = 0.01
 _MILLIMETRE = 0.001
 _UNITS = {_CENTIMETRE: "centimetres", _MILLIMETRE: "millimetres"}
 
 _UNEXPLAINED = attrgetter("unexplained_share")
 
-# Mistakes that each side may have, keys of ``CONVENTIONS``; the first one is no mistake.
+# Mistakes that each side may have, as keys of ``CONVENTIONS``. The first entry is no mistake.
 _CODES = ("", "quaternion_order", "quaternion_names", "inverse_orientation")
 
 
@@ -104,8 +104,8 @@ class Examination:
     scale : float or None
         Rough factor of the child's lengths after the repairs; None if it is not determined.
     child_unit : float
-        Factor from the child's unit of length to metres, if the scale is estimated anyway: then
-        another unit is no finding.
+        Factor from the child's unit of length to metres if the scale is estimated anyway. Another
+        unit is then no finding.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -131,8 +131,8 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
         return Examination(tuple(findings))
     sample = poses.sample()
     if not turns_about_two_axes(poses.parent):
-        # Rotations about one axis do not determine the conventions of the positions. Only their
-        # unit is checked.
+        # Rotations about a single axis do not determine the conventions of the positions. Check
+        # only the unit.
         return _with_units(sample, Examination(), is_scale_free)
     chosen, rivals = _best_hypothesis(sample)
     if axes := _check_axes(sample, chosen):
@@ -157,7 +157,8 @@ def examine(poses: StopPoses, is_scale_free: bool) -> Examination:
 def _check_rotations(poses: StopPoses) -> list[Finding]:
     """Return findings of the checks that use rotations only.
 
-    Rows are not checked if one side is frozen throughout; angles only if nothing else was found.
+    Rows are not checked if one side is frozen throughout. Angles are checked only without other
+    findings.
     """
     findings = [*check_frozen(poses)]
     if all(issue.evidence["share"] < 1.0 for issue in findings):
@@ -169,9 +170,9 @@ def _check_rotations(poses: StopPoses) -> list[Finding]:
 
 
 def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
-    """Return the rough fit of the best hypothesis, and rivals that are equally likely.
+    """Return the rough fit of the best hypothesis, and its rivals with the same likelihood.
 
-    The best hypothesis is that without mistakes, unless mistakes are certain.
+    The best hypothesis is the one without mistakes, unless mistakes are certain.
     """
     plain = [
         rough_fit(sample, Mistakes(is_inverse=is_inverse))
@@ -185,7 +186,7 @@ def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
         return as_given, []
     objectives = {rival: _objective(sample, rival) for rival in _rivals(sample)}
     smallest = min(objectives.values())
-    # Log likelihood that undoing the mistakes of the best rival gains.
+    # Gain of log likelihood if the mistakes of the best rival are undone.
     gain = min(_objective(sample, fit) for fit in plain) - smallest
     if gain < -MIN_LEAD:
         return as_given, []
@@ -202,9 +203,9 @@ def _best_hypothesis(sample: StopPoses) -> tuple[RoughFit, list[Mistakes]]:
 
 
 def _better_setup(fits: Sequence[RoughFit]) -> RoughFit:
-    """Return the better of the fits of both setups (camera on the hand, beside the robot).
+    """Return the better fit of both setups: camera on the hand, camera beside the robot.
 
-    Rotations decide. If both setups explain them about equally, positions decide.
+    Rotations decide. If they fit both setups about equally, positions decide.
     """
     max_share = MIN_IMPROVEMENT * min(fit.rotation_share for fit in fits)
     possible = [fit for fit in fits if fit.rotation_share <= max_share]
@@ -212,7 +213,7 @@ def _better_setup(fits: Sequence[RoughFit]) -> RoughFit:
 
 
 def _with_fewest_mistakes(fits: Sequence[RoughFit]) -> list[RoughFit]:
-    """Return those fits whose hypotheses have the fewest different mistakes."""
+    """Return the fits whose hypotheses have the fewest different mistakes."""
     fewest = min(fit.mistakes.complexity for fit in fits)
     return [fit for fit in fits if fit.mistakes.complexity == fewest]
 
@@ -235,14 +236,14 @@ def _rivals(sample: StopPoses) -> list[RoughFit]:
 
 
 def _objective(sample: StopPoses, fit: RoughFit) -> float:
-    """Return the negative log likelihood of stops solved under the hypothesis of a rough fit."""
+    """Return the negative log likelihood of stops solved under a rough fit's hypothesis."""
     return objective_of(sample.without(fit.mistakes, fit.scale or 1.0))
 
 
 def _check_conventions(
     poses: StopPoses, mistakes: Mistakes, rivals: Sequence[Mistakes]
 ) -> list[Finding]:
-    """Return findings on inverse poses, and on rival hypotheses that are equally likely."""
+    """Return findings about inverse poses, and about rival hypotheses of equal likelihood."""
     findings = []
     if mistakes.is_inverse and not poses.is_arm:
         findings.append(
@@ -256,11 +257,11 @@ def _check_conventions(
 
 
 def _ambiguous(mistakes: Mistakes, rival: Mistakes) -> Finding:
-    """Return the finding that two explanations fit equally well, with the options of both."""
+    """Return the finding that two explanations fit equally well, with the options for each."""
     options = _options_of(mistakes)
     rival_options = _options_of(rival)
-    # Each list has all options that either hypothesis sets, with defaults where necessary. So a
-    # user who sets a list selects one hypothesis.
+    # Both lists have the options of both hypotheses, with default values where necessary. So a user
+    # who sets a list selects one hypothesis.
     first = options | defaults_of(
         name for name in rival_options if name not in options
     )
@@ -292,7 +293,7 @@ def _codes_and_streams(mistakes: Mistakes) -> list[tuple[str, str]]:
 
 
 def _check_agreement(fit: RoughFit) -> list[Finding]:
-    """Return a finding if the residuals of the best hypothesis are too large for noise."""
+    """Return a finding if noise cannot explain the residuals of the best hypothesis."""
     rotation_share = fit.rotation_share
     position_share = fit.position_share
     ratio = fit.position_ratio
@@ -323,9 +324,9 @@ def _check_agreement(fit: RoughFit) -> list[Finding]:
 
 
 def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
-    """Return whether the stops without their outliers do not contradict each other.
+    """Return whether the stops agree after the outliers are removed.
 
-    ``fit`` is the rough fit of all stops. Half of the stops, or more, must be inliers.
+    ``fit`` is the rough fit of all stops. At least half of the stops must be inliers.
     """
     is_inlier = inliers_of(sample.without(fit.mistakes, fit.scale or 1.0))
     if 2 * is_inlier.sum() < len(sample):
@@ -340,10 +341,10 @@ def _do_inliers_agree(sample: StopPoses, fit: RoughFit) -> bool:
 
 
 def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
-    """Return a finding if positions of one side have permuted or flipped axes.
+    """Return a finding if the positions of one side have permuted or flipped axes.
 
-    Such axes must be clearly likelier than the best other hypothesis, whose fit is ``fit``, by the
-    rough fits or by full solves. Strong noise hides the difference from the rough fits.
+    Such axes must be clearly likelier than ``fit``, the best other hypothesis: in the rough fits,
+    or after full solves. Strong noise can hide the difference in the rough fits.
     """
     if fit.unexplained_share < SMALL_UNEXPLAINED:
         return None
@@ -365,9 +366,9 @@ def _check_axes(sample: StopPoses, fit: RoughFit) -> Finding | None:
 
 
 class _OtherAxes(NamedTuple):
-    """Stops whose positions of one side have other axes, with their rough fit.
+    """Stops after a change of the axes of one side's positions, with their rough fit.
 
-    ``axes`` (3, 3) permute and flip the axes of the positions of ``stream``.
+    ``axes`` (3, 3) permutes and flips the axes of the positions of ``stream``.
     """
 
     stream: str
@@ -377,7 +378,7 @@ class _OtherAxes(NamedTuple):
 
 
 def _fits_with_other_axes(sample: StopPoses) -> Iterator[_OtherAxes]:
-    """Yield the stops with other axes of either side whose rough fits explain most of them."""
+    """Yield the stops with changed axes of either side, if a rough fit explains most of them."""
     for is_inverse in sample.possible_inversions:
         mistakes = Mistakes(is_inverse=is_inverse)
         if rough_fit(sample, mistakes).rotation_share > MAX_UNEXPLAINED:
@@ -396,7 +397,7 @@ def _fits_with_other_axes(sample: StopPoses) -> Iterator[_OtherAxes]:
 
 
 def _other_axes() -> Iterator[FloatArray]:
-    """Yield the 47 matrices (3, 3) that permute and flip axes; the identity is left out."""
+    """Yield the 47 matrices (3, 3) that permute and flip axes; the identity is omitted."""
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
             axes = np.diag(signs) @ np.eye(3)[list(order)]
@@ -405,7 +406,7 @@ def _other_axes() -> Iterator[FloatArray]:
 
 
 def _axes_in_words(axes: FloatArray) -> str:
-    """Return permuted and flipped axes as text, such as ``x -y z``."""
+    """Return permuted and flipped axes in words, such as ``x -y z``."""
     names = []
     for row in axes:
         name = "xyz"[int(np.argmax(np.abs(row)))]
@@ -419,9 +420,10 @@ def _axes_in_words(axes: FloatArray) -> str:
 def _with_units(
     sample: StopPoses, examination: Examination, is_scale_free: bool
 ) -> Examination:
-    """Return the examination with findings or repairs of units of length, and the scale left over.
+    """Return the examination with findings or repairs of units, and with the remaining scale.
 
-    The scale left over is the rough factor of the child's lengths once both sides are in metres.
+    The remaining scale is the rough factor of the child's lengths after both sides were converted
+    to metres.
     """
     if not sample.has_positions:
         return examination
@@ -441,7 +443,7 @@ def _with_units(
         units.append(_unit_finding("parent", "parent_scale", of_parent))
     if of_child != 1.0:
         units.append(_unit_finding("child", "scale", of_child))
-    # The places of two vehicles may really be far apart, so large positions alone prove no unit.
+    # Two vehicles may really be far apart, so large positions alone do not prove another unit.
     is_certain = sample.has_target or (len(units) == 1 and scale is not None)
     examination = replace(examination, scale=scale)
     if is_scale_free and of_child != 1.0:
@@ -459,7 +461,7 @@ def _unit_finding(stream: str, option: str, unit: float) -> Finding:
 
 
 def _unit_of_size(positions: FloatArray) -> float:
-    """Return the factor from positions (N, 3) to metres, assumed from their spread."""
+    """Return the factor from positions (N, 3) to metres. It is assumed from their spread."""
     if spread(positions) <= _MAX_SPREAD_M:
         return 1.0
     distance = median(np.linalg.norm(positions, axis=1))

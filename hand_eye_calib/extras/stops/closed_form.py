@@ -1,9 +1,9 @@
-"""Closed form of X and Z from stops, ``A_i X = Z B_i``, as a start of the fit.
+"""Closed form of X and Z from stops, ``A_i X = Z B_i``, from which the fit starts.
 
-A_i and B_i are the poses of the parent and of the child, each in its world. Rotations maximise the
-sum of ``tr(R_X' R_A_i' R_Z R_B_i)``: M. Shah, *Solving the robot-world/hand-eye calibration problem
-using the Kronecker product*, Journal of Mechanisms and Robotics 5(3), 2013, eq. 18. Translations
-follow from ``R_A_i t_X - t_Z = R_Z t_B_i - t_A_i`` by linear least squares.
+A_i and B_i are the poses of parent and child, each in its own world. The rotations maximise the sum
+of ``tr(R_X' R_A_i' R_Z R_B_i)``: M. Shah, *Solving the robot-world/hand-eye calibration problem
+using the Kronecker product*, Journal of Mechanisms and Robotics 5(3), 2013, eq. 18. The
+translations follow from ``R_A_i t_X - t_Z = R_Z t_B_i - t_A_i`` by linear least squares.
 """
 
 from dataclasses import dataclass, replace
@@ -13,13 +13,14 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.geometry import se3
 
-# Further starts: their number, and the random stops of each. If half of the stops are outliers, the
-# chance of 60 starts without any start free of outliers is 0.03 % (0.875 to the 60th power).
+# Number of starts from random subsets of stops. If half of the stops are outliers, the probability
+# that each of 60 subsets has an outlier is 0.03 % (0.875 to the 60th power).
 _N_STARTS = 60
+# Number of stops in a subset.
 _STOPS_PER_START = 3
 
-# Quantile of the errors of all stops by which starts are compared: fewer stops than half may have
-# right poses.
+# Starts are compared by this quantile of the errors of all stops: fewer than half of the stops may
+# be right.
 _COMPARED_QUANTILE = 0.4
 
 
@@ -34,7 +35,8 @@ class Stops:
     Ts_world_child : (N, 4, 4) array
         B_i: poses of the child sensor in its world.
     has_target : bool
-        True if the child is a camera and its world a flat target, whose normal is the z axis.
+        Whether the child is a camera whose world is a flat target. The normal of the target is its
+        z axis.
     """
 
     Ts_world_parent: FloatArray
@@ -65,8 +67,8 @@ def closest_rotations(
         Weights of the stops.
     """
     weighted = R_a if weights is None else weights[:, None, None] * R_a
-    # The sum of tr(X' R_a' Z R_b) is vec(X)' form vec(Z). Its largest singular vectors are X and Z
-    # up to their length and a common sign; the sign makes determinants positive.
+    # The sum of tr(X' R_a' Z R_b) is vec(X)' form vec(Z). The largest singular vectors of the form
+    # are X and Z, up to length and a common sign. The sign is chosen for positive determinants.
     form = np.einsum("nji,nka->iajk", weighted, R_b).reshape(9, 9)
     left_vectors, _, right_vectors = np.linalg.svd(form)
     matrix_X = left_vectors[:, 0].reshape(3, 3)
@@ -77,7 +79,7 @@ def closest_rotations(
 
 
 def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
-    """Return X and Z (4, 4) of all stops by least squares: rotations first, then translations."""
+    """Return the least squares X and Z (4, 4) of all stops: rotations first, then translations."""
     R_A = se3.rotation_of(stops.Ts_world_parent)
     R_B = se3.rotation_of(stops.Ts_world_child)
     R_X, R_Z = closest_rotations(R_A, R_B)
@@ -95,10 +97,10 @@ def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
 
 
 def starts_of(stops: Stops) -> list[tuple[FloatArray, FloatArray]]:
-    """Return X and Z (4, 4) by the closed form of all stops, and by that of a few stops.
+    """Return X and Z (4, 4) from the closed form of all stops, and from that of a few stops.
 
-    The few stops are the best of random subsets: that with the smallest errors of other stops. If
-    the closed form of all stops is better, no other start is returned.
+    The few stops are the random subset with the smallest errors of the other stops. If the closed
+    form of all stops is better, it is the only start.
     """
     random = np.random.default_rng(0)
     n = len(stops)
@@ -119,10 +121,10 @@ def starts_of(stops: Stops) -> list[tuple[FloatArray, FloatArray]]:
 
 
 def _costs(errors: FloatArray) -> FloatArray:
-    """Return the cost (M,) of M candidates with errors (M, N, 4, 4) of N stops.
+    """Return the costs (M,) of M candidates with errors (M, N, 4, 4) at N stops.
 
-    The cost is the logarithm of the product of a quantile of the distances and a quantile of the
-    angles. The stops of a subset have small errors, so the quantile is above these.
+    The cost is the logarithm of the product of two quantiles: of the distances and of the angles. A
+    subset fits its own stops, so the quantile is larger than their share.
     """
     tiny = np.finfo(float).tiny
     n = errors.shape[1]

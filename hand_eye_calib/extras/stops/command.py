@@ -39,7 +39,7 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.reading import read_files, refuse_repeated_paths
 
-# Result, origin of the data in plain values, and functions that draw figures of the report.
+# Result, origin of the data as plain values, and functions that draw further figures of the report.
 SolvedInput: TypeAlias = tuple[
     Calibration, Document, Sequence[Callable[[Calibration], list[Any]]]
 ]
@@ -54,7 +54,7 @@ def solved(arguments: Namespace) -> SolvedInput:
     sources : Document
         Files and numbers of poses, for the result file.
     pictures : sequence of callable
-        Functions that draw further figures of the report from the result.
+        Functions that draw further figures of the report, given the result.
     """
     options = options_from(arguments)
     config = CalibratorConfig.from_options(options)
@@ -112,7 +112,7 @@ def _from_images(
 ) -> SolvedInput:
     """Calibrate an arm from poses of its hand and a folder with images of a target.
 
-    A single path is a folder that contains both.
+    A single path is a folder that contains the poses and the images.
     """
     arguments.pair_by = arguments.pair_by or "row"
     hand_path = Path(arguments.paths[0])
@@ -183,7 +183,7 @@ def _robot(arguments: Namespace) -> Trajectory:
 def _require_equal(
     paths: Sequence[str | Path], n_parent: int, n_child: int
 ) -> None:
-    """Raise InputError if both sides have different numbers of stops."""
+    """Raise InputError if the sides have different numbers of stops."""
     if n_parent != n_child:
         raise InputError(
             f"{paths[0]} has {n_parent} poses and {paths[1]} {n_child}: stops are paired by the "
@@ -206,7 +206,7 @@ def _inputs(arguments: Namespace, n_parent: int, n_child: int) -> Document:
 
 
 def _refuse_ignored(arguments: Namespace) -> None:
-    """Raise ConfigError for an argument that has no effect on stops."""
+    """Raise ConfigError if an argument has no effect on stops."""
     if arguments.pair_by == "time":
         raise ConfigError(
             "--pair-by time has no meaning for stops, which have no stamps; give row"
@@ -229,7 +229,7 @@ def _measuring(
 ) -> CalibratorConfig:
     """Return the options with the kind of data of each stream taken from its file.
 
-    An option of the user other than ``auto`` wins.
+    An option of the user has priority, except ``auto``.
     """
     for stream, trajectory in streams.items():
         if trajectory.measures not in ("poses", "rotations"):

@@ -9,8 +9,8 @@ independent errors:
 - a rotation about the origin of the child, such as that of a robot's hand;
 - a rotation about the origin of the child's world, such as that of a target in a camera. This
   rotation moves the child;
-- for a flat target, a tilt: such a rotation about an axis across the line of sight, which is larger
-  for views from the front (:mod:`hand_eye_calib.extras.stops.flat_target`).
+- for a flat target, a tilt: a rotation as in the last item, about an axis across the line of sight.
+  It is larger for views from the front (:mod:`hand_eye_calib.extras.stops.flat_target`).
 
 Their variances are estimated by restricted maximum likelihood: D. A. Harville, *Maximum likelihood
 approaches to variance component estimation*, JASA 72, 1977. Each iteration is the update of
@@ -29,27 +29,29 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
 
-# Sources that are positions, the first ones; the others are rotations.
+# Number of sources that are positions. They are the first ones; the others are rotations.
 _N_POSITION_SOURCES = 2
 
 # Prior standard deviation of the logarithm of each variance: a factor of 4.5. Measured on stops of
 # simulated arms.
 _PRIOR_SIGMA = 1.5
 
-# Largest number of iterations, and the change at convergence: of X and Z in standard deviations,
-# and of the logarithms of the variances.
+# Largest number of iterations.
 _MAX_ROUNDS = 100
+# The iteration ends if X and Z, in standard deviations, and the log variances change by less.
 _SMALL_CHANGE = 3e-3
 
-# The same for a fit of linear values, whose standard deviations need two digits only.
+# Largest number of iterations for linear values.
 _MAX_LINEAR_ROUNDS = 30
+# Step of linear values, in standard deviations, at which the iteration ends.
 _SMALL_LINEAR_STEP = 0.1
+# Change of the log variances at which the iteration for linear values ends.
 _SMALL_LOG_CHANGE = 0.05
 
-# Smallest variance (m^2, rad^2): that of rounding in poses without errors.
+# Smallest variance (m^2, rad^2): rounding of poses without errors.
 MIN_VARIANCE = 1e-24
 
-# Errors (N, 6) of stops and their derivatives (N, 6, 12), for X and Z.
+# Function that returns the errors (N, 6) of stops and their derivatives (N, 6, 12) for X and Z.
 Linearise = Callable[
     [Stops, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
 ]
@@ -66,9 +68,9 @@ class ComponentsFit:
     information : (12, 12) array
         Fisher information about the right perturbations of X and Z.
     whitening : (N, 6, 6) array
-        Matrices that make the errors of each stop independent, with variance 1.
+        Matrices that make the errors of each stop independent, with unit variance.
     weights : (N,) array
-        Weights of Student's t distribution for each stop.
+        Weight of each stop by Student's t distribution.
     """
 
     T_parent_child: FloatArray
@@ -91,17 +93,17 @@ def fit_components(
     Parameters
     ----------
     stops : Stops
-        Without outliers.
+        Stops without the outliers.
     start : two (4, 4) arrays
         X and Z to start from.
     variances : (2,) array
-        Variances per axis of the positions (m^2) and rotations (rad^2) of a fit without sources.
+        Variances per axis of positions (m^2) and rotations (rad^2), from a fit without sources.
     weights : (N,) array
-        Weights of stops at one place.
+        Weights of the stops, smaller for several stops at one place.
     degrees : float
         Degrees of freedom of the Student-t distribution.
     linearise : callable
-        Errors and derivatives in the frame of the child.
+        Function that returns errors and derivatives in the frame of the child.
     """
     X, Z = start
     sources = _covariances_of_sources(stops)
@@ -144,7 +146,7 @@ class LinearFit:
     covariance : (P, P) array
         Covariance of ``values``. Unobservable directions have large variances.
     weights : (N,) array
-        Weights of Student's t distribution for each stop.
+        Weight of each stop by Student's t distribution.
     """
 
     values: FloatArray
@@ -166,9 +168,9 @@ def fit_linear(
     ----------
     stops : Stops
     errors, jacobian : (N, 6) and (N, 6, P) arrays
-        Errors in the frame of the child if all values are zero, and their derivatives.
+        Errors in the frame of the child for values of zero, and their derivatives.
     variances, weights, degrees
-        As for :func:`fit_components`.
+        See :func:`fit_components`.
     """
     sources = _covariances_of_sources(stops)
     prior = _prior_components(variances, len(sources))
@@ -214,15 +216,15 @@ class _Iteration:
     precisions : (N, 6, 6) array
         Inverse covariances of the errors of each stop.
     student : (N,) array
-        Weights of Student's t distribution.
+        Weights by Student's t distribution.
     step : (P,) array
-        Gauss-Newton step of the values: those of X and Z, and further ones.
+        Gauss-Newton step of the values: X and Z, and further values.
     decrease : float
         Predicted decrease of the objective, times two.
     quadratic : (K,) array
-        Weighted squares of the errors by each source.
+        Weighted squares of the errors from each source.
     expected : (K,) array
-        Expected value of ``quadratic`` under the present variances.
+        Expected value of ``quadratic`` for the present variances.
     """
 
     precisions: FloatArray
@@ -243,8 +245,8 @@ def _iteration(
 ) -> _Iteration:
     """Return one iteration at errors (N, 6) and their derivatives (N, 6, P).
 
-    ``components`` (K,) are the variances of the sources, ``sources`` (K, N, 6, 6) the covariances
-    with variance 1.
+    ``components`` (K,) are the variances of the sources. ``sources`` (K, N, 6, 6) are their
+    covariances for a variance of 1.
     """
     covariances = np.tensordot(components, sources, 1) + MIN_VARIANCE * np.eye(
         6
@@ -257,7 +259,7 @@ def _iteration(
     by_values = precisions @ jacobian
     normal = np.einsum("n,nij,nik->jk", shares, jacobian, by_values)
     gradient = np.einsum("n,nij,ni->j", shares, by_values, errors)
-    # The step along unobservable directions is zero.
+    # Unobservable directions get a step of zero.
     damped = normal + 1e-13 * np.trace(normal) * np.eye(len(normal))
     step = -np.linalg.solve(damped, gradient)
     quadratic = np.einsum("n,ni,knij,nj->k", shares, scores, sources, scores)
@@ -275,16 +277,16 @@ def _updated(
     quadratic: FloatArray,
     expected: FloatArray,
 ) -> FloatArray:
-    """Return the variances (K,) after one iteration of the MM algorithm with the prior."""
-    # Derivative of the prior's log density, times two.
+    """Return the variances (K,) after an iteration of the MM algorithm with the prior."""
+    # Twice the derivative of the prior's log density.
     pull = 2.0 * np.log(prior / components) / _PRIOR_SIGMA**2
     upwards = np.maximum(pull, 0.0)
     downwards = np.maximum(-pull, 0.0)
     numerator = components**2 * quadratic + upwards * components
-    # Rounding may make a value that should be zero negative.
+    # Rounding can make a zero slightly negative.
     not_negative = np.maximum(expected, 0.0)
     denominator = not_negative + downwards / components
-    # A source without effect keeps its variance: that along the line of sight if all positions are
+    # A source without effect keeps its variance, such as the line of sight if all positions are
     # zero.
     squared = np.divide(
         numerator, denominator, out=components**2, where=denominator > 0.0
@@ -295,15 +297,15 @@ def _updated(
 def _prior_components(variances: FloatArray, n_sources: int) -> FloatArray:
     """Return the prior means (K,) of the variances of all sources.
 
-    ``variances`` (2,) are those of positions and rotations. The first two sources are positions,
-    the others rotations.
+    ``variances`` (2,) are the variances of positions and rotations. The first two sources are
+    positions, the others rotations.
     """
     n_rotations = n_sources - _N_POSITION_SOURCES
     return 0.5 * np.repeat(variances, [_N_POSITION_SOURCES, n_rotations])
 
 
 def _covariances_of_sources(stops: Stops) -> FloatArray:
-    """Return the covariances (K, N, 6, 6) of the errors by each source with variance 1."""
+    """Return the covariances (K, N, 6, 6) of the errors from each source, for a variance of 1."""
     n = len(stops)
     to_world = se3.translation_of(se3.inverse(stops.Ts_world_child))
     lengths = np.linalg.norm(to_world, axis=1, keepdims=True)
@@ -327,10 +329,10 @@ def _covariances_of_sources(stops: Stops) -> FloatArray:
 
 
 def _about_world(rotations: FloatArray, to_world: FloatArray) -> FloatArray:
-    """Return covariances (N, 6, 6) of errors that rotate about the origin of the child's world.
+    """Return covariances (N, 6, 6) of errors from rotations about the origin of the child's world.
 
-    ``rotations`` (N, 3, 3) are the covariances of the rotations, ``to_world`` (N, 3) the positions
-    of this origin, both in the frame of the child.
+    ``rotations`` (N, 3, 3) are the covariances of the rotations, and ``to_world`` (N, 3) the
+    positions of this origin, both in the frame of the child.
     """
     levers = se3.skew(to_world)
     covariances = np.empty((len(rotations), 6, 6))

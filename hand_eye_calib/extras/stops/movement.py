@@ -1,8 +1,8 @@
-"""Detect a target or a camera that moved between two stops.
+"""Detect that the target or the camera moved between two stops.
 
-Under this hypothesis X or Z has another value from a stop on. Fit the change for stops on a coarse
-grid, in the order of the stops, by errors that are linear about the solution without a movement.
-The size of the change in standard deviations is a Wald statistic.
+The hypothesis is that X or Z has another value from a certain stop on. The change is fitted at the
+stops of a coarse grid, in the order of the stops. Errors are linearised about the solution without
+a movement. The size of the change in standard deviations is a Wald statistic.
 """
 
 from dataclasses import dataclass
@@ -21,36 +21,38 @@ from hand_eye_calib.extras.stops.lasting_errors import (
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, rows_of
 from hand_eye_calib.extras.stops.rough_fit import MAX_COMPARED
 
-# Shares of the stops before a movement: the grid of the search.
+# Grid of the search: shares of the stops before a movement.
 _SHARES = np.arange(1, 8) / 8.0
 
-# Fewest stops before and after a movement.
+# Fewest stops on each side of a movement.
 _MIN_PART = 4
 
-# Degrees of freedom of the Student-t distribution of errors. Stops near the movement may be in the
-# wrong part, so tails are heavy.
+# Degrees of freedom of Student's t distribution of the errors. The tails are heavy, because stops
+# near the movement may be in the wrong part.
 _DEGREES = 4.0
 
-# Smallest median weight of the stops of either part. Below it, the part consists of outliers.
+# A part consists of outliers if the median weight of its stops is smaller than this.
 _MIN_WEIGHT = 0.3
 
-# Smallest squared size of a movement in standard deviations (six values). It is the first number
-# plus the second number divided by the number of stops: few stops hardly determine the variances.
-# The largest value on the grid without a movement was 32 for simulated stops, and for stops of
-# KinHEC with noise. It was 67 for one arm of 30 stops with errors of its lengths and angles.
+# Smallest squared size of a movement, in standard deviations (six values): this number plus the
+# next number divided by the number of stops, because few stops hardly determine the variances.
+# Largest value on the grid without a movement: 32 for simulated stops and for stops of KinHEC with
+# noise; 67 for an arm of 30 stops with errors of its lengths and angles.
 _MIN_SQUARED = 40.0
 _MIN_SQUARED_TIMES_STOPS = 600.0
 
-# Smallest movement (m, rad). Errors of the lengths and angles of an arm pass for movements of up to
-# 0.0094 m and 0.3 deg in KinHEC.
+# Smallest translation (m) that is a movement. In KinHEC, errors of the lengths and angles of an arm
+# look like movements of up to 0.0094 m and 0.3 deg.
 _MIN_SHIFT_M = 0.015
+# Smallest rotation (rad) that is a movement.
 _MIN_TURN_RAD = 0.026
 
-# Columns of the derivatives: X (6), Z (6) and the scale; then the errors.
+# Number of columns: derivatives with respect to X (6), Z (6) and the scale.
 _N_COLUMNS = 13
+# Columns of the part that moves: X or Z.
 _PARTS = {"camera": slice(0, 6), "target": slice(6, 12)}
 
-# Names of the parts for two sensors that are no arm.
+# Names of the moved parts for two sensors without an arm.
 _SENSOR_PARTS = {
     "camera": "the child on the parent",
     "target": "the world of one sensor",
@@ -70,7 +72,7 @@ class _Movement:
     change : (6,) array
         Right perturbation of X or Z.
     squared : float
-        Squared size of the change in standard deviations.
+        Squared size of the change, in standard deviations.
     """
 
     part: str
@@ -82,7 +84,7 @@ class _Movement:
 def check_movement(
     stops: Stops, fit: RobotWorld, is_arm: bool
 ) -> Finding | None:
-    """Return a finding if the camera or the target clearly moved between two stops."""
+    """Return a finding if the camera or the target has clearly moved between two stops."""
     n = len(stops)
     sampled = np.unique(
         np.linspace(0, n - 1, min(n, MAX_COMPARED)).astype(np.int64)
@@ -109,7 +111,7 @@ def check_movement(
 
 
 def _movements(stops: Stops, fit: RobotWorld) -> list[_Movement]:
-    """Return the fits of a movement of either part at each stop of the grid."""
+    """Return the fits of a movement of camera or target, at each stop of the grid."""
     n = len(stops)
     rows = rows_of(stops, fit)
     errors = rows[:, :, _N_COLUMNS]

@@ -1,9 +1,9 @@
-"""Advice on the next stops of an arm: rotations of the hand that reduce the uncertainty most.
+"""Advice on the next stops of an arm: the hand rotations that reduce the uncertainty most.
 
-A candidate starts from one of the recorded stops. The hand is turned about one of its axes, and
-moved so that the target keeps its place in the image. The stop adds ``J' J`` to the information
-about X and Z, with J the derivatives of its errors over their standard deviations. Candidates are
-chosen one after the other. Each minimises the sum of the variances of X over the squared targets
+A candidate starts from a recorded stop. The hand turns about one of its axes, and moves so that the
+target keeps its place in the image. Such a stop adds ``J' J`` to the information about X and Z; J
+are the derivatives of its errors, divided by their standard deviations. Candidates are chosen in
+turn. Each choice minimises the sum of the variances of X divided by the squared targets
 (A-optimality): F. Pukelsheim, *Optimal design of experiments*, SIAM 2006.
 """
 
@@ -23,16 +23,17 @@ from hand_eye_calib.extras.stops.rough_fit import angles_between
 # Number of stops that are advised.
 _N_NEXT = 3
 
-# Angle of the advised turns (deg). A flat target is still visible well at this angle.
+# Angle (deg) of the advised turns. A flat target is still well visible at this angle.
 _TURN_DEG = 30
 
-# Prior standard deviation of unobservable directions, in standard deviations of a stop's errors.
+# Prior standard deviation of unobservable directions, as a multiple of the standard deviations of a
+# stop.
 _PRIOR_LEVELS = 1e3
 
 
 @dataclass(frozen=True)
 class NextStop:
-    """A stop to add: turn ``frame``, the hand, by ``angle_deg`` about its axis (x, y or z)."""
+    """A stop to record: turn ``frame``, the hand, by ``angle_deg`` about its axis (x, y or z)."""
 
     axis: str
     angle_deg: float
@@ -49,30 +50,30 @@ def next_stops(
     is_inverse: bool,
     targets: FloatArray,
 ) -> tuple[int, tuple[NextStop, ...]]:
-    """Choose the next stops of an arm, the most useful first.
+    """Choose the next stops of an arm; the most useful stop is first.
 
     Parameters
     ----------
     stops : Stops
         Recorded stops.
     fit : RobotWorld
-        Their fit.
+        Fit of these stops.
     frame : str
-        Name of the frame of the hand, which turns.
+        Name of the frame of the hand.
     is_inverse : bool
-        True for a camera beside the robot: then the stops have the inverse poses of the hand.
+        Whether the camera is beside the robot. The stops then have inverse poses of the hand.
     targets : (6,) array
-        Wanted standard deviations of X: x, y, z (m) and the rotations (rad).
+        Targets for the standard deviations of X: x, y, z (m) and the rotations (rad).
 
     Returns
     -------
     start : int
-        Row of the stop that the turns start from.
+        Row of the stop at which the turns start.
     next_stops : tuple of NextStop
     """
-    # The most central orientation.
+    # The stop with the most central orientation.
     start = int(np.argmin(medians(angles_between(stops.Ts_world_parent))))
-    # Information that each candidate adds.
+    # Information added by each candidate.
     gains = {}
     for axis, angle_deg in itertools.product("xyz", (_TURN_DEG, -_TURN_DEG)):
         vector = np.radians(angle_deg) * np.eye(3)["xyz".index(axis)]
@@ -96,7 +97,7 @@ def next_stops(
 
 
 def advice_in_words(number: int, stops: tuple[NextStop, ...]) -> str:
-    """Return the advice as a sentence; ``number`` (from 1) is the stop to start from."""
+    """Return the advice as a sentence. ``number`` (from 1) is the stop at which the turns start."""
     turns = listing([str(stop) for stop in stops])
     return (
         f"record {len(stops)} more stops from stop {number}, with the target still in the image: "
@@ -107,9 +108,9 @@ def advice_in_words(number: int, stops: tuple[NextStop, ...]) -> str:
 def _turned(
     stop: Stops, fit: RobotWorld, vector: FloatArray, is_inverse: bool
 ) -> Stops:
-    """Return a stop with the hand turned by a rotation vector (3,), given in its own axes.
+    """Return a stop after a rotation of the hand by a vector (3,) in its own axes.
 
-    The hand is moved so that the target keeps its position in the camera. ``is_inverse`` as in
+    The hand also moves, so that the target keeps its position in the camera. For ``is_inverse`` see
     :func:`next_stops`.
     """
     X = fit.T_parent_child

@@ -1,4 +1,4 @@
-"""Report stops that are clear outliers of the fit."""
+"""Report stops that are clearly outliers of the fit."""
 
 import numpy as np
 
@@ -10,15 +10,15 @@ from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.flat_target import sines_of_views, usual_sine
 from hand_eye_calib.extras.stops.robot_world import RobotWorld
 
-# Squared Mahalanobis distance (six values) of a stop above which an outlier is clear. There is no
-# finding without a clear outlier: errors of a target's pose differ by some times between views.
-# Measured on simulated images of three targets.
+# An outlier is clear if its squared Mahalanobis distance (six values) exceeds this limit. Without a
+# clear outlier there is no finding: the errors of a target's pose differ between views by a factor
+# of several. Measured on simulated images of three targets.
 _MIN_REPORTED_SQUARED = 225.0
 
-# Share of reported outliers above which the verdict is USE WITH CARE.
+# The verdict is USE WITH CARE if the share of reported outliers exceeds this limit.
 _MAX_LEFT_OUT = 0.1
 
-# Largest number of outliers that a message lists.
+# Largest number of outliers that a message names.
 _MAX_LISTED = 8
 
 
@@ -51,9 +51,10 @@ def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
 
 
 def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
-    """Return the squared Mahalanobis distance (N,) of each stop to its prediction.
+    """Return the squared Mahalanobis distance (N,) of each stop from its prediction.
 
-    The errors are those in the frame of the child, or in that of its world if they are smaller.
+    The errors are in the frame of the child, or in the frame of its world if they are smaller
+    there.
     """
     predicted = (
         se3.inverse(fit.T_world_world)
@@ -65,8 +66,8 @@ def _squared_distances(fit: RobotWorld, stops: Stops) -> FloatArray:
     squared = np.sum(errors.reshape(2, len(stops), 2, 3) ** 2, axis=3)
     positions, rotations = np.moveaxis(squared, 2, 0)
     if stops.has_target:
-        # The angle of a view is the predicted or the measured one, whichever is larger. A rotation
-        # that is wrong by more than this angle is no error of a view from the front.
+        # The angle of a view is the larger of the predicted and the measured angle. A view from the
+        # front does not explain a rotation error above this angle.
         sines = np.maximum(
             sines_of_views(predicted), sines_of_views(stops.Ts_world_child)
         )

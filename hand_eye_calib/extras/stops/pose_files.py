@@ -23,8 +23,8 @@ from hand_eye_calib.formats.yaml_files import read_yaml
 
 _SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 
-# Words for the sides in names of files. ViSP names the pose of b in a ``aPb``, where f is the base,
-# e the end effector, c the camera and o the object (target).
+# Words in file names that stand for a side. ViSP names the pose of b in a ``aPb``, where f is the
+# base, e the end effector, c the camera and o the object (target).
 _ROBOT_WORDS = {
     "pe",
     "robot",
@@ -48,21 +48,22 @@ _TARGET_WORDS = {
     "tracking",
 }
 
-# Words for poses of the robot if no file has a word above, as in ``pos01.yaml`` of Zivid.
+# Words for poses of the robot, used if no file name has a word above, as in ``pos01.yaml`` of
+# Zivid.
 _POSE_WORDS = {"pos", "pose", "poses"}
 
 # Name of a file without its suffix: words, then the number of the stop.
 _NUMBERED_NAME = re.compile(r"(.*?)([0-9]{1,9})")
 
-# Count of numbers of a position and a rotation vector.
+# Count of numbers in a position and a rotation vector together.
 _N_OF_VECTOR = 6
 
 
 def files_of_sides(folder: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    """Return the files of the robot and those of the target in a folder, by number of the stop.
+    """Return the files of the robot and of the target in a folder, by the number of the stop.
 
-    The files are in the folder itself or in its subfolders. Files without a word for the side are
-    ignored, but ``pos01.yaml`` is of the robot if no other file is.
+    The files are in the folder or in its subfolders. Files without a word for a side are ignored.
+    Exception: ``pos01.yaml`` belongs to the robot if no other file does.
     """
     robot: dict[int, Path] = {}
     target: dict[int, Path] = {}
@@ -95,7 +96,7 @@ def read_pose_folder(folder: Path) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     InputError
-        If a file has no pose, or a stop has the pose of one side only.
+        If a file contains no pose, or a stop has only one of both poses.
     """
     robot, target = files_of_sides(folder)
     if not (robot and target):
@@ -120,7 +121,7 @@ def read_robot_folder(folder: Path) -> FloatArray:
     Raises
     ------
     InputError
-        If the folder has no such file, or a file has no pose.
+        If the folder contains no such file, or a file contains no pose.
     """
     robot, _ = files_of_sides(folder)
     if not robot:
@@ -145,7 +146,7 @@ def _read_pose(path: Path) -> FloatArray:
 
 
 def _only_value(document: Any) -> Any:
-    """Return the value of a document with a single name, such as ``PoseState`` of Zivid."""
+    """Return the value of a document that has a single name, such as ``PoseState`` of Zivid."""
     while isinstance(document, Mapping) and len(document) == 1:
         (document,) = document.values()
     return document

@@ -1,4 +1,4 @@
-"""Convert poses that a robot's controller displays: a position and angles in its convention.
+"""Convert poses as a robot's controller displays them: a position and angles in its convention.
 
 R is the rotation of the hand in the base; Rx, Ry and Rz are rotations about the axes x, y and z.
 
@@ -32,7 +32,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import pose_stack
 from hand_eye_calib.formats.files import read_text
 
-# Axes of the angles as SciPy names them: small letters are fixed axes, capitals moving ones.
+# Axes of the angles in SciPy's notation: small letters are fixed axes, capitals are moving axes.
 _AXES = {"fanuc": "xyz", "kawasaki": "ZYZ", "kuka": "ZYX", "yaskawa": "xyz"}
 
 #: Makers of robots whose convention of angles is implemented.
@@ -54,7 +54,7 @@ def robot_poses(rows: Any, robot: str) -> FloatArray:
     ConfigError
         If the robot is unknown.
     InputError
-        If the rows have another number of values, or are no poses.
+        If the rows have a different number of values, or are not poses.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def _rotations(angles: FloatArray, robot: str) -> FloatArray:
 def read_robot_poses(path: Path, robot: str) -> FloatArray:
     """Read the poses (N, 4, 4) of a robot from a text file with one pose on each line.
 
-    Empty lines are skipped, and so is a first line with names of columns.
+    Empty lines and a first line with names of columns are skipped.
     """
     rows = []
     lines = read_text(path, "poses of a robot").splitlines()

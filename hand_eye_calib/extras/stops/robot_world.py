@@ -6,11 +6,11 @@ pose of the child in the parent. Z is the pose of the child's world in the paren
 target in the base of the robot. The order of the stops has no meaning.
 
 The error of stop i is ``xi_i = Log(B_i^-1 Z^-1 A_i X)`` in the frame of the child, or the same
-error in the frame of the child's world. It has a Student-t distribution. For outliers and for
-hypotheses, it has one variance for the three values of the position and one for those of the
-rotation. Solve by Gauss-Newton steps with weights and variances from the expectation-maximisation
-algorithm: K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
-distribution*, JASA 84, 1989. The result has the variances of
+error in the frame of the child's world. It has a Student-t distribution. Outliers are detected, and
+hypotheses compared, with one variance for the position and one for the rotation. Gauss-Newton steps
+use weights and variances from the expectation-maximisation algorithm: K. L. Lange, R. J. A. Little,
+J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989. The final
+fit has the variances of
 :mod:`hand_eye_calib.extras.stops.error_components`.
 """
 
@@ -36,45 +36,45 @@ from hand_eye_calib.extras.stops.lasting_errors import (
     views_of_stops,
 )
 
-# Fewest stops: X needs two motions with rotations about different axes, which are three stops.
+# Fewest stops: X needs two motions with rotations about different axes, so three stops.
 MIN_STOPS = 3
 
-# Degrees of freedom of the Student-t distribution of errors. Measured: between 4 and 30 degrees of
-# freedom, stops of two real arms that were not used for the fit agree with it equally well, to 1 %.
-# If errors are normal (KinHEC), errors of the rotation are 3 % larger at 12 and 2 % at 16 than at
-# 1000.
+# Degrees of freedom of the Student-t distribution of errors. Measured: for 4 to 30 degrees of
+# freedom, the result predicts unused stops of two real arms equally well, to 1 %. For normal errors
+# (KinHEC), rotation errors are 3 % larger at 12 and 2 % at 16 than at 1000.
 _DEGREES = 16.0
 
-# A stop is an outlier if its squared Mahalanobis distance (six values) is larger. Normal errors
-# exceed this limit once in 300,000 stops (chi-square).
+# A stop is an outlier if its squared Mahalanobis distance (six values) exceeds this limit. Normal
+# errors exceed it at one of 300,000 stops (chi-square).
 _OUTLIER_SQUARED = 36.0
 
-# Degrees of freedom while outliers are detected. Tails are so heavy then that a few outliers hardly
-# change the variances.
+# Degrees of freedom for the detection of outliers. The tails are so heavy that a few outliers
+# hardly change the variances.
 _OUTLIER_DEGREES = 3.0
 
-# Smallest number of degrees of freedom, times the number of stops less two: with fewer, a few stops
-# would fit exactly and all others be outliers.
+# The degrees of freedom, times the number of stops minus two, are at least this. Otherwise a few
+# stops would fit exactly, and all other stops would be outliers.
 _FEWEST_DEGREES = 16.0
 
 # Number of estimated values: six of X and six of Z.
 _N_VALUES = 12
 
-# Iterations of weights, variances and a Gauss-Newton step: their largest number, and the step (in
-# standard deviations of the values) below which they have converged.
+# Largest number of iterations. Each iteration updates weights and variances, then takes a
+# Gauss-Newton step.
 _MAX_ROUNDS = 60
+# The iteration ends at a smaller step, in standard deviations of the values.
 _SMALL_STEP = 1e-2
 
 # A direction of X is observable if the mean squared rotation between stops that determines it
-# exceeds this multiple of the variance of a measured rotation. Below it, errors of the rotations
-# may pass for rotations.
+# exceeds this multiple of the variance of a measured rotation. Smaller rotations may be errors.
 _DETERMINED = 8.0
 
-# Prior standard deviation of the scale of the child's lengths, as a share: a usual error of the
+# Prior standard deviation of the scale of the child's lengths, relative to 1: a usual error of the
 # size of a target or of a focal length.
 STRETCH = 0.03
 
-# Largest number of stops whose correlations are computed together: memory grows with its square.
+# Largest number of stops whose correlations are computed together. The memory grows with its
+# square.
 _MAX_STOPS_AT_ONCE = 300
 
 
@@ -89,13 +89,13 @@ class RobotWorld:
     T_world_world : (4, 4) array
         Z: pose of the child's world in the parent's world.
     covariance : (12, 12) array
-        Covariance of the right perturbations (rho, phi) of X in the frame of the child, then of
-        those of Z in the frame of the child's world. Unobservable directions have large variances.
+        Covariance of the right perturbations (rho, phi): X in the frame of the child, then Z in the
+        frame of the child's world. Unobservable directions have large variances.
     information : (12, 12) array
-        Fisher information about the same perturbations if errors of stops are independent.
+        Fisher information about the same perturbations, if the errors of different stops are
+        independent.
     weights : (N,) array
-        Weight of each stop: 1 for errors up to the standard deviations, less for larger errors, 0
-        for an outlier.
+        Weight of each stop: 1 for errors of usual size, less for larger errors, 0 for an outlier.
     level_m, level_rad : float
         Standard deviations of the errors of a stop's position and rotation, per axis.
     objective : float
@@ -103,11 +103,11 @@ class RobotWorld:
     converged : bool
         Whether the last step of the fit was small.
     scale_step : float
-        Relative change of the scale of the child's lengths that would fit best, to first order.
+        Relative change of the scale of the child's lengths with the best fit, to first order.
     scale_sigma : float
         Standard deviation of ``scale_step``; infinite if the stops do not determine the scale.
     scale_inflation : float
-        Factor by which errors that last over several stops increase the variance of the scale.
+        Factor by which errors that last for several stops increase the variance of the scale.
     """
 
     T_parent_child: FloatArray
@@ -130,7 +130,7 @@ class RobotWorld:
         marginal = self.information[:6, :6] - to_others @ others @ to_others.T
         levels = np.repeat([self.level_m, self.level_rad], 3)
         n_used = max(int(np.sum(self.weights > 0.0)), 1)
-        # The information of X times the variances of a stop: mean squared rotations (rad^2).
+        # Information of X times the variances of a stop: mean squared rotations (rad^2).
         squared_turns = marginal * np.outer(levels, levels) / n_used
         eigenvalues, directions = np.linalg.eigh(squared_turns)
         return directions[:, eigenvalues < _DETERMINED * self.level_rad**2]
@@ -142,10 +142,11 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
     Parameters
     ----------
     stops : Stops
-        At least three.
+        At least three stops.
     stretch : float
-        Prior standard deviation of the scale of the child's lengths, as a share; infinite without
-        prior knowledge. The scale itself stays 1. The covariance contains its uncertainty.
+        Prior standard deviation of the scale of the child's lengths, relative to 1; infinite
+        without prior knowledge. The scale itself remains 1. The covariance contains its
+        uncertainty.
 
     Raises
     ------
@@ -154,10 +155,11 @@ def solve(stops: Stops, stretch: float = STRETCH) -> RobotWorld:
 
     Notes
     -----
-    The starts are closed forms of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers are
-    detected with heavy tails and left out, with errors in the frame of the child or in that of the
-    child's world (a target whose pose a camera measures), whichever is likelier. The fit of the
-    other stops has both kinds of errors: :mod:`hand_eye_calib.extras.stops.error_components`.
+    The fit starts from the closed forms of :mod:`hand_eye_calib.extras.stops.closed_form`. Outliers
+    are detected with heavy tails and left out. For this step, the errors are either in the frame of
+    the child or in that of the child's world (a target whose pose a camera measures), whichever is
+    likelier. The fit of the remaining stops has both kinds of errors:
+    :mod:`hand_eye_calib.extras.stops.error_components`.
     """
     if len(stops) < MIN_STOPS:
         raise NotEnoughDataError(
@@ -197,7 +199,7 @@ def objective_of(stops: Stops) -> float:
 
 
 def inliers_of(stops: Stops) -> BoolArray:
-    """Return a mask (N,) of the stops, at least three, that are not outliers."""
+    """Return a mask (N,) of the inliers among at least three stops."""
     return _robust_fit(stops).weights > 0.0
 
 
@@ -207,9 +209,9 @@ def _robust_fit(stops: Stops) -> RobotWorld:
 
 
 def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
-    """Return the fit with errors in the frame of the child or of its world, the likelier one.
+    """Return the likelier fit: with errors in the frame of the child, or of its world.
 
-    ``rests`` (N,) are weights of stops at one place. Weights of outliers are 0.
+    ``rests`` (N,) are the weights of stops at one place, with 0 for outliers.
     """
     fits = [
         _fit_without_outliers(stops, start, in_world, rests)
@@ -220,9 +222,9 @@ def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
 
 
 def _inverse_of(information: FloatArray, rough: RobotWorld) -> FloatArray:
-    """Return the covariance (12, 12) of X and Z; unobservable directions have large variances.
+    """Return the covariance (12, 12) of X and Z. Unobservable directions have large variances.
 
-    Their prior has a thousand times the standard deviations of a stop in the fit ``rough``.
+    Their prior standard deviations are a thousand times those of a stop in the fit ``rough``.
     """
     prior = np.tile(
         np.repeat([1e-3 / rough.level_m, 1e-3 / rough.level_rad], 3), 2
@@ -240,8 +242,9 @@ def _fit_without_outliers(
 ) -> RobotWorld:
     """Detect outliers with heavy tails, then fit the other stops.
 
-    The errors are in the frame of the child's world if ``in_world``, else in that of the child.
-    ``rests`` (N,) are weights of stops at one place. The result's weights are 0 for outliers.
+    With ``in_world``, the errors are in the frame of the child's world; otherwise in the frame of
+    the child. ``rests`` (N,) are weights of stops at one place. Outliers have weight 0 in the
+    result.
     """
     n = len(stops)
     fewest_degrees = _FEWEST_DEGREES / (n - 2)
@@ -258,7 +261,7 @@ def _fit_without_outliers(
     )
     weights = np.zeros(n)
     weights[is_kept] = fit.weights
-    # In the objective, each outlier has the squared distance of the limit.
+    # Each outlier counts with the squared distance of the limit in the objective.
     log_levels = 6.0 * (np.log(fit.level_m) + np.log(fit.level_rad))
     n_left_out = float(np.sum(weights == 0.0))
     objective = fit.objective + 0.5 * n_left_out * (
@@ -275,8 +278,8 @@ def _linearise(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the errors xi (N, 6) of stops, and their derivatives (N, 6, 12).
 
-    The derivatives are with respect to the right perturbations of X and Z. The errors are in the
-    frame of the child's world if ``in_world``, else in the frame of the child.
+    The derivatives are with respect to the right perturbations of X and Z. With ``in_world``, the
+    errors are in the frame of the child's world; otherwise in the frame of the child.
     """
     predicted = se3.inverse(Z) @ stops.Ts_world_parent @ X
     measured_inverse = se3.inverse(stops.Ts_world_child)
@@ -296,8 +299,8 @@ def _variances(
 ) -> FloatArray:
     """Estimate the variances (2,) per axis of positions (m^2) and rotations (rad^2).
 
-    Four stops or fewer do not determine both: the positions may fit exactly. Then the variance of
-    positions is that of rotations times the variance of the child's positions.
+    Four stops or fewer do not determine both variances: the positions may fit exactly. Then the
+    variance of positions is the variance of rotations times the variance of the child's positions.
 
     Parameters
     ----------
@@ -310,10 +313,10 @@ def _variances(
         Degrees of freedom of the Student-t distribution.
     """
     n = len(stops)
-    # Degrees of freedom of either variance: the fit uses half of the twelve values for each.
+    # Degrees of freedom of each variance. The fit uses half of the twelve values for each.
     n_free = max(3.0 * n - 0.5 * _N_VALUES, 0.5)
-    # Sum of the weights at convergence. The variances converge sooner if they are normalised by it:
-    # C. Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
+    # Sum of the weights at convergence. The variances converge faster if they are divided by it: C.
+    # Liu, D. B. Rubin, Y. N. Wu, *Parameter expansion to accelerate EM*, Biometrika 85, 1998.
     final_sum = ((degrees + 6.0) * n - 2.0 * n_free) / degrees
     means = final_sum / weights.sum() * (weights @ squared) / n_free
     if 3 * n <= _N_VALUES:
@@ -337,7 +340,7 @@ def _gauss_newton_step(products: FloatArray) -> FloatArray:
     ``products`` (n + 1, n + 1) are ``[J e]' [J e]`` of the whitened derivatives J and errors e.
     """
     normal = products[:-1, :-1]
-    # The step along unobservable directions is zero.
+    # Unobservable directions get a step of zero.
     damping = 1e-13 * np.trace(normal) * np.eye(len(normal))
     return -np.linalg.solve(normal + damping, products[:-1, -1])
 
@@ -349,7 +352,7 @@ def _fit(
     degrees: float,
     rests: FloatArray,
 ) -> RobotWorld:
-    """Fit X and Z by alternating variances, weights and Gauss-Newton steps.
+    """Fit X and Z: update variances and weights, take a Gauss-Newton step, and repeat.
 
     Parameters
     ----------
@@ -357,7 +360,7 @@ def _fit(
     start : two (4, 4) arrays
         X and Z to start from.
     in_world : bool
-        Whether the errors are in the frame of the child's world, else in that of the child.
+        Whether the errors are in the frame of the child's world, instead of the child's frame.
     degrees : float
         Degrees of freedom of the Student-t distribution.
     rests : (N,) array
@@ -417,14 +420,14 @@ class _Stretch(NamedTuple):
     Attributes
     ----------
     step : float
-        Relative change of the scale that would fit best.
+        Relative change of the scale with the best fit.
     sigma : float
         Standard deviation of ``step``; infinite if the stops do not determine the scale.
     scores : (12, 12) array
-        Covariance that the unknown scale adds to that of the scores ``J' e``, where J are the
-        whitened derivatives with respect to X and Z and e the whitened errors.
+        Covariance that the unknown scale adds to the covariance of the scores ``J' e``. J are the
+        whitened derivatives with respect to X and Z, and e the whitened errors.
     inflation : float
-        Factor by which errors that last over several stops increase the variance of the scale.
+        Factor by which errors that last for several stops increase the variance of the scale.
     """
 
     step: float
@@ -441,19 +444,19 @@ def _with_lasting_errors(
     views: FloatArray,
     stretch: float,
 ) -> RobotWorld:
-    """Return a fit whose covariance allows for correlated errors and for an unknown scale.
+    """Return a fit whose covariance includes correlated errors and an unknown scale.
 
-    Errors of stops may be correlated (last over several stops, or return with the place of the
-    arm). The covariance is ``H^-1 S H^-1`` with the information H and the covariance S of the
-    scores under these correlations (sandwich estimator).
+    Errors of stops may be correlated: they last for several stops, or return with the place of the
+    arm. With the information H and the covariance S of the scores under these correlations, the
+    covariance is ``H^-1 S H^-1`` (sandwich estimator).
 
     Parameters
     ----------
     stops : Stops
-        Without outliers.
+        Stops without the outliers.
     fit : RobotWorld
     whitening : (N, 6, 6) array
-        Matrices that make the errors of each stop independent, with variance 1.
+        Matrices that make the errors of each stop independent, with unit variance.
     rests : (N,) array
         Weights of stops at one place.
     views : (N, 13) array
@@ -465,7 +468,7 @@ def _with_lasting_errors(
     weighted = rows * np.sqrt(fit.weights[fit.weights > 0.0])[:, None, None]
     first = slice(_MAX_STOPS_AT_ONCE)
     shares = kernel_weights(correlations(views[first]), weighted[first])
-    # Covariance that correlations add to the scores of X, Z and the scale.
+    # Covariance that the correlations add to the scores of X, Z and the scale.
     lasting = np.zeros((13, 13))
     n_parts = -(-len(stops) // _MAX_STOPS_AT_ONCE)
     for part in np.array_split(np.arange(len(stops)), n_parts):
@@ -477,7 +480,7 @@ def _with_lasting_errors(
     whitened = np.sqrt(rests)[:, None, None] * weighted
     longer = _stretch_of(whitened.reshape(-1, 14), lasting, stretch)
     scores = lasting[:12, :12] + longer.scores
-    # Few stops hardly determine the variances of the errors.
+    # Few stops hardly determine the variances of the errors. The factor covers this uncertainty.
     level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * _N_VALUES, 0.5)
     covariance = level_factor * (
         fit.covariance + fit.covariance @ scores @ fit.covariance
@@ -492,7 +495,7 @@ def _with_lasting_errors(
 
 
 def whitened_rows(stops: Stops, fit: RobotWorld) -> FloatArray:
-    """Return derivatives and errors (N, 6, 14) of stops, over the standard deviations of errors.
+    """Return derivatives and errors (N, 6, 14) of stops, divided by their standard deviations.
 
     The columns are those of :func:`rows_of`.
     """
@@ -503,10 +506,10 @@ def whitened_rows(stops: Stops, fit: RobotWorld) -> FloatArray:
 def rows_of(stops: Stops, fit: RobotWorld) -> FloatArray:
     """Return derivatives and errors (N, 6, 14) of stops, in the frame of the child.
 
-    The columns are the derivatives with respect to X and Z (12), the derivative with respect to the
-    scale of the child's lengths (1), and the errors (1). The derivative has the predicted positions
-    of the child. Measured positions have noise that is part of the errors, too, and would make the
-    estimated scale too small.
+    The columns are: derivatives with respect to X and Z (12), the derivative with respect to the
+    scale of the child's lengths (1), and the errors (1). The derivative by the scale uses predicted
+    positions of the child. Measured positions contain noise that is also in the errors, and would
+    make the estimated scale too small.
     """
     errors, jacobian = _linearise(stops, fit.T_parent_child, fit.T_world_world)
     predicted = (
@@ -537,7 +540,7 @@ def _stretch_of(
     """
     size = np.sum(rows**2)
     products = rows.T @ rows + 1e-12 * size * np.eye(14)
-    # Components of the scale's derivative, and of the errors along it, that X and Z cannot explain.
+    # Parts of the scale's derivative, and of the errors along it, that X and Z cannot explain.
     by_length, by_errors = np.linalg.cholesky(products)[12:, 12]
     direction = np.append(
         -np.linalg.solve(products[:12, :12], products[:12, 12]), 1.0
@@ -547,7 +550,7 @@ def _stretch_of(
     )
     step = 0.0
     sigma = math.inf
-    # The regularisation of ``products`` alone would give a value below this limit.
+    # The regularisation of ``products`` alone could produce a value below this limit.
     if by_length > 2e-6 * math.sqrt(float(size)):
         step = -by_errors / by_length
         sigma = math.sqrt(inflation) / by_length

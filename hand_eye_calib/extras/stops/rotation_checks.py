@@ -1,8 +1,8 @@
 """Checks of stops that use rotations only: frozen poses, wrong rows, wrong kinds of angles.
 
-Between two stops both sensors rotate by the same angle, whatever the extrinsic is. So the matrices
-(N, N) of the angles between all stops are equal for parent and child. They differ if rows do not
-belong together, or if Euler angles were taken for rotation vectors.
+Between two stops, both sensors rotate by the same angle, for any extrinsic. So the matrices (N, N)
+of the angles between all stops are equal for parent and child. They differ if the rows do not
+belong together, or if Euler angles were read as rotation vectors.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,42 +25,47 @@ from hand_eye_calib.extras.stops.rough_fit import (
     rough_fit,
 )
 
-# Fewest stops that are checked. Four stops have twelve coordinates, and seven lengths (translations
-# of X and Z, scale) fit to them: fewer than six stops hardly contradict any hypothesis.
+# Fewest stops that are checked. Four stops have twelve coordinates, to which seven lengths
+# (translations of X and Z, scale) are fitted. With fewer than six stops, hardly any hypothesis is
+# contradicted.
 MIN_STOPS_TO_CHECK = 6
 
-# Another order of rows, or another kind of angles, is accepted if the median difference of the
-# angles between stops becomes smaller by this factor.
+# Another order of rows, or another kind of angles, must reduce the median difference of the angles
+# between stops by this factor.
 MIN_IMPROVEMENT = 3.0
 
-# Unexplained shares (median residual over spread). Below the first limit the stops are explained.
-# Above the second one a hypothesis is wrong. Above the third one both sides do not belong together.
-# Measured: three real arms (MoveIt, ETHZ, CamOdoCal) have 0.015 to 0.07, simulated arms 0.01, sides
-# that do not belong together 0.5.
+# Limits of the unexplained share (median residual divided by spread). Measured: 0.015 to 0.07 for
+# three real arms (MoveIt, ETHZ, CamOdoCal), 0.01 for simulated arms, 0.5 for sides that do not
+# belong together. Below this limit the stops are explained.
 SMALL_UNEXPLAINED = 0.04
+# Above this limit a hypothesis is wrong.
 MAX_UNEXPLAINED = 0.3
+# Above this limit both sides do not belong together.
 UNRELATED_UNEXPLAINED = 0.5
 
-# Largest difference (m, rad) between a pose and the one before if it is a repetition: rounding.
+# A pose is a repetition of the previous pose if they differ by at most this (m, rad), which is
+# rounding.
 _ROUNDING = 1e-6
 
-# Largest number of rows by which one side is shifted for a test.
+# Largest number of rows by which one side is shifted in a test.
 _MAX_SHIFT = 3
 
-# Rows are shifted from some row on if this increases the log likelihood, for each pair of stops, by
+# The rows from some row on are shifted if this increases the log likelihood per pair of stops by
 # more than this limit. Measured on 7 to 30 stops of KinHEC and of simulated arms: at most 0.21
-# without a fault; 0.4 or more in 99 % of the sets with a missing row.
+# without a fault, and at least 0.4 in 99 % of the sets with a missing row.
 _MIN_BLOCK_GAIN = 0.3
 
-# Kinds of angles whose differences are within this factor of the smallest one agree equally well.
+# Several kinds of angles agree equally well if their differences are within this factor of the
+# smallest difference.
 _MAX_EQUAL_RATIO = 1.5
 
-# Rotation vectors of a tool that points down are short or long, by stop: number of stops whose
-# vector is tried both ways as a start, and largest number of rounds over all stops.
+# For a tool that points down, each stop has a short and a long rotation vector. This is the number
+# of stops at which both vectors are tried as a start.
 _N_STARTING_STOPS = 3
+# Largest number of rounds in which each stop chooses one of its vectors.
 _MAX_CHOICE_ROUNDS = 5
 
-# Number of random orders of rows that the given order is compared with.
+# Number of random orders of the rows with which the given order is compared.
 _N_RANDOM_ORDERS = 8
 
 _BOTH_WAYS = (("parent", "child"), ("child", "parent"))
@@ -87,7 +92,7 @@ def check_frozen(poses: StopPoses) -> Iterator[Finding]:
 
 
 def check_rows(poses: StopPoses) -> Iterator[Finding]:
-    """Yield a finding if rotations of both sides agree only with rows shifted or reordered."""
+    """Yield a finding if the rotations agree only after rows are shifted or reordered."""
     of_parent = angles_between(poses.parent[:MAX_COMPARED])
     of_child = angles_between(poses.child[:MAX_COMPARED])
     difference_rad = median_difference(of_parent, of_child)
@@ -102,7 +107,7 @@ def check_rows(poses: StopPoses) -> Iterator[Finding]:
         if reordered_rad < smallest_rad:
             best = order.text
             smallest_rad = reordered_rad
-    # If the orientations hardly differ, any order agrees.
+    # Orientations that hardly differ agree in any order.
     if best and difference_rad > MIN_TURN_RAD / 2:
         yield finding("rows", text=best)
     else:
@@ -110,7 +115,7 @@ def check_rows(poses: StopPoses) -> Iterator[Finding]:
 
 
 class _Order(NamedTuple):
-    """Rows of the parent and of the child that may belong together, and the order as text."""
+    """An order of the rows of parent and child, and its description in words."""
 
     text: str
     parent_rows: IntArray
@@ -118,7 +123,7 @@ class _Order(NamedTuple):
 
 
 def _usual_orders(n: int) -> Iterator[_Order]:
-    """Yield orders of n rows that undo usual mistakes: shifts, reversal, files sorted by name."""
+    """Yield orders of n rows that undo usual mistakes: shifts, reversal, sorting files by name."""
     rows = np.arange(n)
     for shift in range(1, _MAX_SHIFT + 1):
         if n - shift < MIN_STOPS_TO_CHECK:
@@ -150,12 +155,12 @@ def _usual_orders(n: int) -> Iterator[_Order]:
 def _check_shifted_block(
     of_parent: FloatArray, of_child: FloatArray
 ) -> Iterator[Finding]:
-    """Yield a finding if one side misses a row: from there on, its rows are shifted by one.
+    """Yield a finding if one side misses a row, so that its further rows are shifted by one.
 
     Parameters
     ----------
     of_parent, of_child : (N, N) arrays
-        Angles between the stops of each side, rad.
+        Angles between all stops of each side, rad.
     """
     blocks = [
         _likeliest_block(of_parent, of_child),
@@ -170,17 +175,17 @@ def _check_shifted_block(
 def _likeliest_block(
     angles: FloatArray, angles_of_other: FloatArray
 ) -> tuple[float, int]:
-    """Return the gain of shifting the likeliest block of rows by one, and its first row.
+    """Return the gain of the likeliest block that is shifted by one row, and its first row.
 
-    In the block, which reaches to the last row, row i of ``angles`` (N, N) belongs to row i + 1 of
-    ``angles_of_other``. The gain of log likelihood is per pair of stops. Differences of angles have
-    a Cauchy distribution. Its scale is their 20 % quantile without or with the shift, whichever is
-    smaller.
+    The block extends to the last row. In the block, row i of ``angles`` (N, N) belongs to row i + 1
+    of ``angles_of_other``. The gain is the increase of the log likelihood per pair of stops.
+    Differences of angles have a Cauchy distribution, whose scale is their 20 % quantile: without or
+    with the shift, whichever is smaller.
     """
     own = angles[:-1, :-1]
     in_place_rad = np.abs(angles - angles_of_other)[:-1, :-1]
     shifted_rad = np.abs(own - angles_of_other[1:, 1:])
-    # Differences of angles between a row before the block and a row in the block.
+    # Differences of angles between rows before the block and rows in the block.
     across_rad = np.abs(own - angles_of_other[:-1, 1:])
     quantiles_rad = [
         np.quantile(above_diagonal(differences_rad), 0.2)
@@ -225,7 +230,7 @@ def _reversed_angles(rotations: FloatArray) -> FloatArray:
 
 
 def _long_vectors(rotations: FloatArray) -> FloatArray:
-    """Return rotation vectors (N, 3) longer than half a turn: the same rotations the other way."""
+    """Return the rotation vectors (N, 3) longer than half a turn, of the same rotations."""
     vectors = se3.rotation_log(rotations)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
     return np.asarray(vectors * (1.0 - 2.0 * np.pi / lengths))
@@ -234,8 +239,8 @@ def _long_vectors(rotations: FloatArray) -> FloatArray:
 def _vectors_of_one_sign(rotations: FloatArray) -> FloatArray:
     """Return rotation vectors (N, 3) with the same sign along their main axis.
 
-    Rotations of a tool that points down are near half a turn, where the sign of a rotation vector
-    is arbitrary. Robots print them with one sign.
+    The rotations of a tool that points down are near half a turn, where the sign of the rotation
+    vector is arbitrary. Robots print all of them with one sign.
     """
     vectors = se3.rotation_log(rotations)
     main_axis = int(np.argmax(medians(np.abs(vectors.T))))
@@ -248,7 +253,7 @@ _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
 _REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
 
-# For each kind of angles: the function from three numbers (N, 3) to rotations (N, 3, 3).
+# For each kind of angles, the function from three numbers (N, 3) to rotations (N, 3, 3).
 _ROTATIONS_OF: dict[str, _Conversion] = {
     _VECTORS: se3.rotation_exp,
     _FIXED: se3.rotation_from_rpy,
@@ -256,8 +261,8 @@ _ROTATIONS_OF: dict[str, _Conversion] = {
     _REVERSED: _rotations_of_reversed_angles,
 }
 
-# For each kind of angles: the function from rotations to three numbers. Rotation vectors are
-# ambiguous by a full turn, so they have three functions.
+# For each kind of angles, the function from rotations to three numbers. Rotation vectors have three
+# functions, because they are ambiguous by a full turn.
 _NUMBERS_OF: tuple[tuple[str, _Conversion], ...] = (
     (_VECTORS, se3.rotation_log),
     (_VECTORS, _long_vectors),
@@ -269,9 +274,9 @@ _NUMBERS_OF: tuple[tuple[str, _Conversion], ...] = (
 
 
 class _AngleKind(NamedTuple):
-    """Rotations of one side with their three numbers taken for another kind of angles.
+    """Rotations of one side, if its three numbers are read as another kind of angles.
 
-    ``difference_rad`` is the median difference of the angles between stops to the other side's.
+    ``difference_rad`` is the median difference between the angles between stops of both sides.
     """
 
     difference_rad: float
@@ -281,7 +286,7 @@ class _AngleKind(NamedTuple):
 
     @property
     def unexplained_share(self) -> float:
-        """Unexplained share of the better setup with these rotations."""
+        """Unexplained share with these rotations, for the better setup."""
         fits = [
             rough_fit(self.poses, Mistakes(is_inverse=is_inverse))
             for is_inverse in (False, True)
@@ -290,7 +295,7 @@ class _AngleKind(NamedTuple):
 
 
 def check_angles(poses: StopPoses) -> Iterator[Finding]:
-    """Yield a finding if rotations agree only as another kind of angles, or do not agree at all."""
+    """Yield a finding if rotations agree only as another kind of angles, or not at all."""
     sample = poses.sample()
     of_parent = angles_between(sample.parent)
     of_child = angles_between(sample.child)
@@ -327,9 +332,9 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
 def _other_kinds(
     sample: StopPoses, stream: str, angles_of_other: FloatArray
 ) -> Iterator[_AngleKind]:
-    """Yield the rotations of a stream, taken for each other kind of angles.
+    """Yield the rotations of a stream for each other kind of angles.
 
-    ``angles_of_other`` are the angles (N, N) between the stops of the other stream, rad.
+    ``angles_of_other`` (N, N) are the angles between the stops of the other stream, rad.
     """
     Ts = getattr(sample, stream)
     R = se3.rotation_of(Ts)
@@ -358,7 +363,7 @@ def _angle_kind(
     text: str,
     angles_of_other: FloatArray,
 ) -> _AngleKind:
-    """Return a kind of angles, whose rotations (N, 3, 3) of ``stream`` are compared."""
+    """Return a kind of angles, with its rotations (N, 3, 3) of ``stream`` compared."""
     positions = se3.translation_of(getattr(sample, stream))
     reread = se3.from_rotation_translation(rotations, positions)
     difference_rad = median_difference(angles_between(reread), angles_of_other)
@@ -370,10 +375,10 @@ def _angle_kind(
 def _agreeing_rotations(
     both: tuple[FloatArray, FloatArray], angles_of_other: FloatArray
 ) -> FloatArray:
-    """Return for each of N stops that of two rotations which agrees with the other side.
+    """Return, for each of N stops, the rotation of two that agrees with the other side.
 
-    A start takes one rotation of one stop, and for the other stops those that agree with it. Then
-    the rotations that agree best with all others are taken, until they stay the same.
+    A start takes one rotation of one stop. The other stops get the rotation that agrees with it.
+    Then each stop gets the rotation that agrees best with all other stops, until nothing changes.
 
     Parameters
     ----------
@@ -409,7 +414,7 @@ def _agreeing_rotations(
 
 
 def _are_unrelated(of_parent: FloatArray, of_child: FloatArray) -> bool:
-    """Return whether both sides agree hardly better than with their rows in random order."""
+    """Return whether both sides agree hardly better than with rows in random order."""
     random = np.random.default_rng(0)
     in_random_order_rad = []
     for _ in range(_N_RANDOM_ORDERS):

@@ -1,11 +1,11 @@
-"""Fast robust fit of stops, to test a hypothesis about their conventions.
+"""Fast robust fit of stops, which tests a hypothesis about their conventions.
 
 A hypothesis is a mistake, such as a wrong order of quaternions, that is undone before the fit.
-Stops obey ``A_i X = Z B_i``, see :mod:`hand_eye_calib.extras.stops.robot_world`. Rotations are
-fitted first, by M. Shah's closed form with Cauchy weights. Translations of X and Z, and a scale s
-of the child's lengths, follow from a robust linear regression of
-``R_A t_X - t_Z - s R_Z t_B = -t_A``. Right conventions leave small residuals: small beside the
-spread of the poses, and as small as errors of the rotations let expect.
+Stops obey ``A_i X = Z B_i``, see :mod:`hand_eye_calib.extras.stops.robot_world`. The rotations are
+fitted first, by M. Shah's closed form with Cauchy weights. The translations of X and Z, and a scale
+s of the child's lengths, follow from a robust linear regression of ``R_A t_X - t_Z - s R_Z t_B =
+-t_A``. Right conventions leave residuals that are small relative to the spread of the poses, and as
+small as the rotation errors predict.
 """
 
 from dataclasses import dataclass, replace
@@ -26,19 +26,20 @@ from hand_eye_calib.extras.stops.closed_form import Stops, closest_rotations
 # Largest number of stops that are compared with each other. The time grows with its square.
 MAX_COMPARED = 150
 
-# Iterations of the robust weights of a fit.
+# Number of iterations for the robust weights of a fit.
 _MAX_ROUNDS = 8
 
-# Rotations between stops below this angle (rad, 3 deg) are too small to judge conventions.
+# Rotations between stops below this angle (rad; 3 deg) cannot reveal wrong conventions.
 MIN_TURN_RAD = 0.05
 
-# Smallest divisor, where lengths (m) or angles (rad) of poses without noise may be zero.
+# Smallest divisor. Lengths (m) or angles (rad) of noise-free poses may be zero.
 _TINY = 1e-12
 
-# A mistake is certain if undoing it increases the log likelihood by at least both of these: a
-# constant, and log 2 for each coordinate (three for each stop), as if the errors were halved.
-# Measured: mistakes in 30 stops of KinHEC with strong noise gain 190 to 400; the limit is 62 there.
+# A mistake is certain if undoing it increases the log likelihood by at least two limits: this
+# constant, and log 2 per coordinate (three per stop), as if the errors were halved. Measured:
+# mistakes in 30 stops of KinHEC with strong noise gain 190 to 400; the limit is 62.
 _MIN_GAIN = 36.0
+# Limit per coordinate.
 _GAIN_PER_COORDINATE = float(np.log(2.0))
 
 
@@ -52,11 +53,11 @@ class StopPoses:
         Poses of the parent sensor in its world, and of the child sensor in its own world. For an
         arm: poses of the hand in the base, and of the camera in the target.
     is_arm : bool
-        True for an arm: the camera may be on the hand or beside the robot.
+        Whether the poses are from an arm: the camera may be on the hand or beside the robot.
     has_target : bool
-        True if the poses of the child are those of the target in the camera.
+        Whether the poses of the child are poses of the target in the camera.
     has_positions : bool
-        False if only the rotations are known.
+        Whether positions are known, in addition to rotations.
     """
 
     parent: FloatArray
@@ -70,7 +71,7 @@ class StopPoses:
 
     @property
     def possible_inversions(self) -> tuple[bool, ...]:
-        """Values of ``Mistakes.is_inverse`` that are possible without a mistake."""
+        """Values of ``Mistakes.is_inverse`` that can be right."""
         return (False, True) if self.is_arm else (False,)
 
     def sample(self) -> "StopPoses":
@@ -90,7 +91,7 @@ class StopPoses:
         )
 
     def without(self, mistakes: "Mistakes", scale: float = 1.0) -> Stops:
-        """Return stops of ``A X = Z B``, with mistakes undone and the child's lengths scaled."""
+        """Return the stops of ``A X = Z B`` without mistakes, with scaled lengths of the child."""
         A = _in_usual_convention(self.parent, mistakes.parent)
         B = _in_usual_convention(scaled(self.child, scale), mistakes.child)
         if self.has_target:
@@ -118,7 +119,7 @@ class Mistakes:
 
     @property
     def complexity(self) -> int:
-        """Number of different mistakes: one exporter often makes the same mistake on both sides."""
+        """Number of different mistakes. The same mistake on both sides counts once."""
         return len({self.parent, self.child} - {""})
 
 
@@ -131,11 +132,11 @@ class RoughFit:
     mistakes : Mistakes
         Hypothesis: mistakes that were undone before the fit.
     rotation_share, position_share : float
-        Unexplained shares of the rotations and of the positions: median residual over spread. A
-        perfect fit has 0; sides that do not belong together have about 1.
+        Unexplained shares of rotations and positions: median residual divided by spread. It is 0
+        for a perfect fit, and about 1 for sides that do not belong together.
     position_ratio : float
-        Median residual of the positions, over the position error that errors of the rotations cause
-        at the distance of the target.
+        Median residual of the positions, divided by the position error that the rotation errors
+        cause at the distance of the target.
     scale : float or None
         Factor of the child's lengths; None if the stops do not determine it.
     log_likelihood : float
@@ -156,7 +157,7 @@ class RoughFit:
 
 
 def min_certain_gain(n_stops: int) -> float:
-    """Return the smallest gain of log likelihood that makes a mistake in n stops certain."""
+    """Return the smallest gain of log likelihood for which a mistake in n stops is certain."""
     return max(_MIN_GAIN, 3.0 * n_stops * _GAIN_PER_COORDINATE)
 
 
@@ -206,7 +207,8 @@ def rough_fit(poses: StopPoses, mistakes: Mistakes) -> RoughFit:
     B = stops.Ts_world_child
     error_rad, Z = _fit_rotations(se3.rotation_of(A), se3.rotation_of(B))
     turns_rad = [median(above_diagonal(angles_between(Ts))) for Ts in (A, B)]
-    # Noise may be as large as rotations of few degrees, so the share is limited for these.
+    # Noise may be as large as rotations of a few degrees. Limit the divisor, so that their share is
+    # small.
     rotation_share = error_rad / max(*turns_rad, MIN_TURN_RAD)
     if not poses.has_positions:
         return RoughFit(mistakes, rotation_share, 0.0)
@@ -242,7 +244,7 @@ def _fit_rotations(
 
 
 def _in_usual_convention(Ts: FloatArray, code: str) -> FloatArray:
-    """Return poses with one mistake, a key of ``CONVENTIONS``, undone; unchanged if it is empty."""
+    """Return poses with a mistake, a key of ``CONVENTIONS``, undone; unchanged if it is empty."""
     if not code:
         return Ts
     option, value = CONVENTIONS[code]
@@ -268,8 +270,8 @@ def _fit_positions(
     if scale > 0.0 and error_of_none > error_of_free * np.exp(gain):
         smaller_spread = min(spread(of_parent), scale * spread(of_child))
         return error_of_free / max(smaller_spread, _TINY), error_of_free, scale
-    # The scale is not determined: the hand only rotates about one point, or there is a mistake.
-    # Then both sides must have one unit of length.
+    # The scale is undetermined: the hand only rotates about one point, or there is a mistake. Both
+    # sides must have the same unit of length in this case.
     error, _ = _regression(levers, of_parent - of_child)
     return error / max(spread(of_parent), spread(of_child), _TINY), error, None
 

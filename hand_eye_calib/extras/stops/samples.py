@@ -1,4 +1,4 @@
-"""Samples of a robot arm: at each stop the pose of the hand and that of a target in a camera.
+"""Samples of a robot arm: at each stop, the poses of the hand and of a target in a camera.
 
 Files that are read:
 
@@ -82,14 +82,14 @@ _CALIBRATION_ENDING = ".calib"
 
 _CALIBRATION = "a calibration of easy_handeye2, in YAML"
 
-# Key of the type of a calibration in files of easy_handeye, and the place of the camera by it.
+# Key of the type of a calibration in files of easy_handeye.
 _TYPE = "calibration_type"
 _SETUPS = {"eye_in_hand": "hand", "eye_on_base": "beside"}
 
 
 @dataclass(frozen=True)
 class ArmSamples:
-    """Samples of an arm: at N stops, the pose of the hand and that of the target.
+    """Samples of an arm: the poses of the hand and of the target at N stops.
 
     Attributes
     ----------
@@ -98,16 +98,17 @@ class ArmSamples:
     tracking : (N, 4, 4) array
         Poses of the target in the camera.
     frames : mapping of str to str
-        Names of the frames by the keys base, hand, camera and target; empty if the file has none.
+        Names of the frames, with the keys base, hand, camera and target. Empty if the file has no
+        names.
     setup : {"hand", "beside"} or None
-        Place of the camera that the file states; None if it states none.
+        Place of the camera according to the file, if stated.
     calibration : Path or None
-        Further file that states ``frames`` and ``setup``; None if the samples state them.
+        Second file, if ``frames`` and ``setup`` come from it; otherwise None.
 
     Raises
     ------
     InputError
-        If there are not as many poses of the robot as of the target.
+        If the numbers of poses of the robot and of the target differ.
     """
 
     robot: FloatArray
@@ -132,13 +133,13 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
     Raises
     ------
     InputError
-        If the file cannot be read or has no samples; one line that names the file.
+        If the file cannot be read or has no samples. The message has one line and names the file.
 
     Notes
     -----
-    Arguments of OpenCV are read by their names, also those of base2gripper and cam2target. For a
-    camera beside the robot OpenCV takes the poses of the base in the gripper under the name
-    gripper2base: give ``parent_invert="poses"`` then.
+    Arguments of OpenCV are read by their names, including base2gripper and cam2target. For a camera
+    beside the robot, OpenCV expects the poses of the base in the gripper under the name
+    gripper2base. Set ``parent_invert="poses"`` in this case.
 
     Examples
     --------
@@ -164,7 +165,7 @@ def read_arm_samples(path: str | Path) -> ArmSamples:
 
 
 def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
-    """Return the samples of a document that lists the stops one by one (MoveIt, easy_handeye)."""
+    """Return the samples of a document that lists stop by stop (MoveIt, easy_handeye)."""
     parameters: Mapping[str, Any] = {}
     calibration = None
     if isinstance(document, Mapping) and "samples" in document:
@@ -191,7 +192,7 @@ def _listed_samples(path: str | Path, document: Any) -> ArmSamples:
 
 
 def _samples_in(path: str | Path, document: Any) -> list[Any]:
-    """Return the samples of a document, one for each stop.
+    """Return the samples of a document, one sample for each stop.
 
     Raises
     ------
@@ -219,10 +220,10 @@ def _parameters_of(document: Any) -> Mapping[str, Any]:
 
 
 def _calibration_beside(samples: Path) -> Path | None:
-    """Return easy_handeye2's calibration with the name of the samples; None if there is none.
+    """Return easy_handeye2's calibration with the same name as the samples, or None.
 
-    The calibration is in the folder of the samples, or in the folder ``calibrations`` beside that
-    folder. The samples of easy_handeye2 have empty parameters.
+    The calibration is in the folder of the samples, or in the folder ``calibrations`` beside it.
+    The samples of easy_handeye2 have empty parameters.
     """
     name = samples.with_suffix(_CALIBRATION_ENDING).name
     folder = samples.absolute().parent
@@ -251,7 +252,7 @@ def _numbered_pairs(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
 
 
 def _both_poses(sample: Any) -> Sequence[Any]:
-    """Return both poses of a sample, the robot's first."""
+    """Return both poses of a sample, first that of the robot."""
     if isinstance(sample, Mapping):
         names = next(
             (names for names in _NAMES if {*names} <= sample.keys()), ()
@@ -265,7 +266,7 @@ def _both_poses(sample: Any) -> Sequence[Any]:
 
 
 def _refuse_half_sample(sample: Mapping[str, Any]) -> None:
-    """Raise an InputError if a sample has the pose of one side only."""
+    """Raise an InputError if a sample has only one of both poses."""
     for names in _NAMES:
         missing = [name for name in names if name not in sample]
         if len(missing) == 1:
@@ -280,7 +281,7 @@ def _refuse_half_sample(sample: Mapping[str, Any]) -> None:
 
 
 def _opencv_samples(document: Mapping[str, Any]) -> ArmSamples | None:
-    """Return the samples of a document with OpenCV's arguments; None if they are missing."""
+    """Return the samples of a document with OpenCV's arguments, or None if some are missing."""
     # For each pair of source and target frame: rotation and translation.
     transforms: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in _with_stacks(document).items():
@@ -306,7 +307,7 @@ def _opencv_poses(
 ) -> FloatArray | None:
     """Return the poses (N, 4, 4) of frame ``source`` in frame ``target``; None if missing.
 
-    Inverse poses (of ``target`` in ``source``) are inverted.
+    If only the poses of ``target`` in ``source`` exist, they are inverted.
     """
     for frames in ((source, target), (target, source)):
         transform = transforms.get(frames, {})
@@ -318,7 +319,7 @@ def _opencv_poses(
 
 
 def _with_stacks(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document with names in lower case; values of numbered names become lists."""
+    """Return a document with lower-case names, in which the values of numbered names are lists."""
     values: dict[str, Any] = {}
     stacks: dict[str, dict[int, Any]] = {}
     for key, value in document.items():
@@ -336,8 +337,8 @@ def _with_stacks(document: Mapping[str, Any]) -> dict[str, Any]:
 def _arrays_of(rotations: Any, translations: Any) -> tuple[Any, Any]:
     """Return rotations and translations of a FileStorage of OpenCV as arrays.
 
-    A FileStorage has one matrix of all stops, or a list with a matrix for each stop. Other values
-    are returned unchanged.
+    A FileStorage has one matrix for all stops, or a list with one matrix per stop. Other values are
+    returned unchanged.
     """
     if not (_are_matrices(rotations) and _are_matrices(translations)):
         return rotations, translations

@@ -24,22 +24,22 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# The scale of the child's lengths is not 1 if it differs from 1 by more than this many standard
-# deviations, and by more than this share.
+# The scale of the child's lengths is not 1 if it differs from 1 by more than this number of
+# standard deviations, and by more than the next limit.
 _MIN_SCALE_SIGMAS = 3.0
+# The scale must also differ from 1 by more than this.
 _MIN_SCALE_CHANGE = 0.01
 
-# Largest factor between the assumed and the true size of a target. A larger scale has another
-# cause.
+# Largest factor between assumed and true size of a target. A larger scale has another cause.
 _MAX_SIZE_RATIO = 10.0
 
-# Iterations of the estimate of the scale: their largest number, and the step (as a share of its
-# standard deviation) below which it has converged.
+# Largest number of iterations for the estimate of the scale.
 _MAX_SCALE_ROUNDS = 10
+# The iteration ends at a step below this share of the standard deviation of the scale.
 _SMALL_STEP = 0.02
 
-# Median rotation of stops (rad, 10 deg) above which all directions are observable for any camera.
-# If one is not, the stops contradict each other.
+# Median rotation of stops (rad, 10 deg) above which every direction is observable for any camera.
+# If a direction is unobservable then, the stops contradict each other.
 _LARGE_TURN_RAD = 0.17
 
 
@@ -54,13 +54,13 @@ class SetupFit:
     stops : Stops
         Poses A and B of ``A X = Z B`` under the setup.
     is_inverse : bool
-        True if the poses of one side were inverted: the camera is beside the robot.
+        Whether the poses of one side were inverted, because the camera is beside the robot.
     scale : float
-        Factor that the child's lengths were multiplied by.
+        Factor by which the child's lengths were multiplied.
     scale_sigma : float
         Standard deviation of ``scale``; 0 if the scale was not estimated.
     lead : float
-        Log likelihood of this setup minus that of the other one.
+        Log likelihood of this setup minus that of the other setup.
     """
 
     fit: RobotWorld
@@ -102,13 +102,13 @@ class _Repaired:
     poses : StopPoses
         Poses in the usual convention and in metres.
     config : CalibratorConfig
-        Options of the user, and those of the repairs.
+        Options of the user, together with the options of the repairs.
     unit : float
         Factor that converted the child's lengths to metres.
     rough_scale : float
-        Further factor of the child's lengths by a rough fit, as a start; 1 if it is unknown.
+        Further factor of the child's lengths from a rough fit, used as a start; 1 if unknown.
     findings, warnings : lists
-        Findings, and warnings about repairs. The solve appends to both.
+        Findings, and warnings about repairs. The solve appends to both lists.
     """
 
     poses: StopPoses
@@ -120,7 +120,7 @@ class _Repaired:
 
 
 def inversions_in_words(config: CalibratorConfig) -> str:
-    """Return as text which options for inverse poses of an arm the user can still give."""
+    """Return the options for inverse poses of an arm that the user can still set, in words."""
     sides = {"parent_invert": "robot", "child_invert": "target"}
     given = [name for name in sides if getattr(config, name) == "poses"]
     others = [
@@ -147,12 +147,12 @@ def solve_checked(
     config : CalibratorConfig
         Options of the user.
     setup : {"hand", "beside"}, optional
-        Place of the camera of an arm. Default: the likelier one.
+        Place of the camera of an arm; by default the likelier place.
 
     Raises
     ------
     ConfigError
-        If the scale is to be estimated from rotations alone.
+        If the scale must be estimated, but only rotations are measured.
     """
     if config.scale == "estimate" and not poses.has_positions:
         raise ConfigError(
@@ -192,15 +192,15 @@ def solve_checked(
 
 
 def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
-    """Check stops, and repair certain mistakes unless the user set the option."""
+    """Check stops. Repair certain mistakes, except where the user set the option."""
     is_scale_free = config.scale in ("auto", "estimate")
     examination = examine(
         _in_metres(poses, config, config.given_scale), is_scale_free
     )
-    # If the scale is estimated, it contains the unit of the child's lengths.
+    # An estimated scale contains the unit of the child's lengths.
     unit = config.given_scale * examination.child_unit
     findings, repairs = _with_user_options(examination, config)
-    # The rough scale holds only if all repairs are done.
+    # The rough scale is valid only if all repairs are applied.
     is_whole = len(repairs) == len(examination.repairs)
     rough_scale = examination.scale if is_whole else None
     warnings = []
@@ -218,7 +218,7 @@ def _repaired(poses: StopPoses, config: CalibratorConfig) -> _Repaired:
 def _in_metres(
     poses: StopPoses, config: CalibratorConfig, child_unit: float
 ) -> StopPoses:
-    """Return poses in metres and in the usual convention, by the options.
+    """Return poses in metres and in the usual convention, according to the options.
 
     ``child_unit`` is the factor from the child's lengths to metres.
     """
@@ -238,10 +238,10 @@ def _in_metres(
 def _with_user_options(
     examination: Examination, config: CalibratorConfig
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings and repairs, by the options that the user set.
+    """Return findings and repairs after a comparison with the options that the user set.
 
-    A repair becomes a finding if the user set one of its options, or one of the options of another
-    repair with the same code. An ambiguous finding is omitted if the user set all of its options.
+    A repair becomes a finding if the user set one of its options, or an option of another repair
+    with the same code. An ambiguous finding is omitted if the user set all of its options.
     """
     findings = []
     for issue in examination.findings:
@@ -265,19 +265,19 @@ def _with_user_options(
 
 
 def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
-    """Return a finding whose options take account of the values that the user set.
+    """Return a finding whose options include the values that the user set.
 
-    The checks examine poses after the user's options are applied. So the option of a finding and
-    the user's option are combined: factors are multiplied, and two inverse conventions give the
-    default.
+    The checks examine poses to which the user's options were already applied. So the option of a
+    finding and the option of the user are combined: factors are multiplied, and two inverse
+    conventions yield the default.
     """
     options: dict[str, float | str] = {}
     for name, value in issue.options.items():
         current = getattr(config, name)
         if current == value or {current, value} == {"wxyz", "yzwx"}:
-            # The data were right, and the user's option made them wrong: the finding proposes the
-            # inverse of that option. wxyz and yzwx are inverse to each other; every other
-            # convention is its own inverse.
+            # The data were right, and the user's option made them wrong. The finding proposes the
+            # inverse of the option. wxyz and yzwx are inverse to each other; every other convention
+            # is its own inverse.
             options[name] = getattr(CalibratorConfig, name)
         elif isinstance(value, float) and isinstance(current, float):
             options[name] = value * current
@@ -289,7 +289,7 @@ def _with_user_values(issue: Finding, config: CalibratorConfig) -> Finding:
 def _options_of(
     repairs: Sequence[Finding], config: CalibratorConfig
 ) -> dict[str, Any]:
-    """Return the options of all repairs; ``parent_scale`` includes the factor of the user."""
+    """Return the options of all repairs. ``parent_scale`` includes the factor of the user."""
     options: dict[str, Any] = {}
     for repair in repairs:
         options |= repair.options
@@ -306,7 +306,7 @@ def _options_of(
 def _likelier_setup(
     poses: StopPoses, scale: float, setup: str | None
 ) -> SetupFit:
-    """Return the fit of the likelier setup, or of the setup that the user chose.
+    """Return the fit of the setup that the user chose, or of the likelier setup.
 
     ``scale`` is a factor of the child's lengths.
     """
@@ -325,7 +325,7 @@ def _likelier_setup(
 
 
 def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
-    """Return whether the stops determine the scale of the child's lengths: no error, two axes."""
+    """Return whether the stops determine the scale of the child's lengths: two axes, no error."""
     return (
         not has_error(findings)
         and poses.has_positions
@@ -334,7 +334,7 @@ def _determines_scale(poses: StopPoses, findings: Sequence[Finding]) -> bool:
 
 
 def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
-    """Return the fit with the scale of the child's lengths estimated by iterated linear steps."""
+    """Return the fit with an estimated scale of the child's lengths, by iterated linear steps."""
     mistakes = Mistakes(is_inverse=setup_fit.is_inverse)
     scale = setup_fit.scale
     for _ in range(_MAX_SCALE_ROUNDS):
@@ -354,10 +354,10 @@ def _with_estimated_scale(poses: StopPoses, setup_fit: SetupFit) -> SetupFit:
 def _with_checked_scale(
     setup_fit: SetupFit, repaired: _Repaired, setup: str | None
 ) -> SetupFit:
-    """Return the fit with unchanged lengths of the child, or with an estimated scale.
+    """Return the fit with an estimated scale, or with the lengths of the child unchanged.
 
-    The scale is estimated if it is clearly not 1, or if the user asks for it. The first case is
-    added to the findings of ``repaired`` unless the option ``scale`` allows it.
+    The scale is estimated if it is clearly not 1, or if the user requests it. If it is clearly not
+    1, and the option ``scale`` does not allow this, ``repaired`` gets a finding.
     """
     poses = repaired.poses
     config = repaired.config
@@ -390,9 +390,10 @@ def _with_checked_scale(
 
 
 def _scale_in_words(scale: float, sigma: float, unit: float) -> str:
-    """Return the estimated scale as text, with the option that leaves the lengths unchanged.
+    """Return the estimated scale in words, with the option that leaves the lengths unchanged.
 
-    ``unit`` is the factor from the child's lengths to metres if the option must contain it, else 1.
+    ``unit`` is the factor from the child's lengths to metres if the option must contain it;
+    otherwise 1.
     """
     option = "none" if unit == 1.0 else unit
     return (
@@ -411,9 +412,10 @@ def _is_clearly_not_one(free: SetupFit) -> bool:
 def _with_movement(
     poses: StopPoses, setup_fit: SetupFit, findings: list[Finding]
 ) -> list[Finding]:
-    """Return the findings, with a movement of the camera or of the target if there is one.
+    """Return the findings, with a movement of the camera or of the target if it is significant.
 
-    The movement replaces the finding that stops disagree. Other errors may look like a movement.
+    The movement replaces the finding that stops disagree, if it is the only error. Otherwise the
+    other errors may look like a movement.
     """
     others = [issue for issue in findings if issue.key != "disagreeing_stops"]
     if has_error(others) or not (
@@ -427,9 +429,9 @@ def _with_movement(
 def _check_unknown(
     poses: StopPoses, fit: RobotWorld, findings: Sequence[Finding]
 ) -> list[Finding]:
-    """Return a finding if directions of X are unobservable.
+    """Return a finding if the motion leaves directions of X unobservable.
 
-    The cause is that the stops rotate about one axis only, or that they contradict each other.
+    Either the stops rotate about a single axis, or they contradict each other.
     """
     if not turns_about_two_axes(poses.parent):
         return (

@@ -1,4 +1,4 @@
-"""Table of stops in a result: residual and view of each stop, and advice on the next ones."""
+"""Table of the stops in a result, with residuals, views, and advice on the next stops."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -20,13 +20,13 @@ class Stop:
     Attributes
     ----------
     number : int
-        Number of the stop, from 1 in the order of the input.
+        Number of the stop in the order of the input, from 1.
     residual_m, residual_deg : float
         Distance and angle between the measured pose and the pose that the result predicts.
     is_used : bool
-        False for an outlier, which the fit leaves out.
+        Whether the fit uses the stop; False for an outlier.
     position_m : tuple of 3 floats
-        Position of the child sensor in its world: of the camera in the frame of the target.
+        Position of the child sensor in its world, such as the camera in the frame of the target.
     direction : tuple of 3 floats
         Optical axis: unit vector of the child sensor's z axis, in its world.
     """
@@ -48,9 +48,9 @@ class StopTable:
     rows : tuple of Stop
         All stops in the order of the input.
     start : int
-        Number of the stop that the advised stops start from; 0 without advice.
+        Number of the stop at which the advised turns start; 0 without advice.
     next : tuple of NextStop
-        Advised stops, the most useful first; empty if the stops contradict each other.
+        Advised stops, the most useful one first; empty if the stops contradict each other.
     advice : str
         Advised stops as a sentence.
     """
@@ -91,13 +91,13 @@ def stop_table(
 
 
 class StopsPart(Part):
-    """Part ``stops`` of a result; documents of results without stops have no such field."""
+    """Part ``stops`` of a result. Documents of other results lack this field."""
 
     def __init__(self) -> None:
         super().__init__("stops", lambda: StopTable)
 
     def write(self, value: StopTable | None) -> Document:
-        """Return the field ``stops`` of a document; none without the part."""
+        """Return the field ``stops`` of a document; empty if the result has no such part."""
         return {} if value is None else {"stops": value}
 
     def advice(self, value: StopTable, result: Any) -> str:
@@ -114,7 +114,7 @@ class StopsPart(Part):
 
 
 def _row_in_words(row: Stop) -> str:
-    """Return number and residual of a stop as text."""
+    """Return number and residual of a stop in words."""
     left_out = "" if row.is_used else " (left out)"
     residual_rad = float(np.radians(row.residual_deg))
     return f"{row.number}{left_out}: {length(row.residual_m)}, {angle(residual_rad)}"

@@ -13,7 +13,7 @@ from hand_eye_calib.core.results.document import matrix_of
 from hand_eye_calib.core.results.parts import ExtraTransform, Part
 from hand_eye_calib.core.results.stored import covariance_of, transform_of
 
-# Values of the option ``setup`` (place of the camera of an arm), and their text.
+# Values of the option ``setup`` (place of the camera of an arm), with their texts.
 SETUPS = {"hand": "on the hand", "beside": "beside the robot"}
 
 # Attributes of :class:`Worlds` whose values are texts.
@@ -48,7 +48,7 @@ class Worlds:
 
 
 class WorldsPart(Part):
-    """Part ``worlds`` of a result: five attributes, and the same five fields of a document."""
+    """Part ``worlds`` of a result: five attributes, stored as five fields of a document."""
 
     def __init__(self) -> None:
         super().__init__("worlds", lambda: Worlds)
@@ -63,7 +63,7 @@ class WorldsPart(Part):
         return getattr(value, name)
 
     def write(self, value: Worlds | None) -> Document:
-        """Return the fields of a document, without T_world_world: :meth:`transforms` returns it."""
+        """Return the fields of a document. T_world_world is left to :meth:`transforms`."""
         if value is None:
             return {"parent_world_frame": "", "child_world_frame": ""}
         document: Document = {
@@ -80,7 +80,7 @@ class WorldsPart(Part):
         return document
 
     def read(self, document: Mapping[str, Any]) -> Worlds | None:
-        """Return the part that a document contains; None if there is none."""
+        """Return the part in a document, or None if it has none."""
         if document.get("T_world_world") is None:
             return None
         return Worlds(
