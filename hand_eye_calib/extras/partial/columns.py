@@ -5,11 +5,11 @@ In a window of some seconds, the residual of sample i of a measured stream is
     e_i = sum_k c_ki f_k + nuisances + noise.
 
 The column c_k is the derivative of the residuals with respect to the unknown f_k. The first
-unknowns correct the extrinsic, the others are sizes of faults, such as a delay. The nuisances are
-unknowns that each window has for itself, such as the pose of its world: they are projected out. A
-column with noise has an instrument, which is the same column computed from the other stream
-(W. Greene, *Econometric Analysis*, 2012, chapter 8). The windows have robust weights. A jackknife
-over blocks of windows estimates the covariance.
+unknowns correct the extrinsic; the others are sizes of faults, such as a delay. Each window also
+has unknowns of its own, such as the pose of its world: these nuisances are projected out. A column
+with noise has an instrument, the same column computed from the other stream (W. Greene,
+*Econometric Analysis*, 2012, chapter 8). The windows have robust weights. A jackknife over blocks
+of windows estimates the covariance.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,23 +26,23 @@ from hand_eye_calib.core.geometry import se3
 
 # Shortest window (s), for short recordings.
 _MIN_WINDOW_S = 4.0
-# Fewest samples of a window. At least half of them must be used.
+# Fewest samples in a window. At least half of them must be used.
 _MIN_SAMPLES = 12
-# Number of windows below which the windows of a short recording become shorter.
+# Windows of a short recording become shorter, so that there are at least this number of them.
 _ENOUGH_WINDOWS = 16
-# Fewest windows of a regression.
+# Fewest windows in a regression.
 _MIN_WINDOWS = 6
 
-# Largest deviation of the duration of four steps from the usual, as a share. A larger deviation
-# means that a gap is nearby.
+# A sample is skipped if the duration of the four steps around it deviates from the usual duration
+# by more than this share: a gap is nearby.
 _MAX_DEVIATION = 0.3
 
 # Number of iterations of the robust weights.
 _N_ITERATIONS = 4
-# Residual of a window that has half the weight, in median residuals.
+# A window whose residual has this size, in median residuals, gets half of the full weight.
 _HALF_WEIGHT = 2.0
 
-# Largest number of blocks of the jackknife.
+# Largest number of blocks for the jackknife.
 _MAX_BLOCKS = 16
 
 
@@ -54,9 +54,9 @@ class Column(NamedTuple):
     sigma : float
         Prior standard deviation of the unknowns, in their unit: the usual size of the fault.
     rows : callable
-        Function that computes the columns (W, K, 3, m) from the windows.
+        Function that computes the columns (W, K, 3, m) of the windows.
     instrument : callable, optional
-        Function that computes the same columns from the other stream. Without it, the columns are
+        Function that computes the same columns from the other stream. By default, the columns are
         their own instrument.
     """
 
@@ -66,7 +66,7 @@ class Column(NamedTuple):
 
 
 def by_axis(vectors: FloatArray) -> FloatArray:
-    """Return vectors (..., 3) as diagonal matrices (..., 3, 3): one column for each coordinate."""
+    """Return vectors (..., 3) as diagonal matrices (..., 3, 3): one column per coordinate."""
     return vectors[..., None] * np.eye(3)
 
 
@@ -76,11 +76,12 @@ class Split(NamedTuple):
     Attributes
     ----------
     size : int
-        Number K of samples of a window.
+        Number K of samples in a window.
     is_enough : (W',) bool array
-        Which of all W' windows of the recording have enough used samples. Only these W are kept.
+        Which of all W' windows of the recording have enough used samples. Only those W windows are
+        kept.
     is_used : (W, K) bool array
-        Samples without a gap nearby.
+        Samples that are not near a gap.
     """
 
     size: int
@@ -88,7 +89,7 @@ class Split(NamedTuple):
     is_used: BoolArray
 
     def __call__(self, values: FloatArray) -> FloatArray:
-        """Return the values (N, ...) of all samples in windows, (W, K, ...)."""
+        """Return the values (N, ...) of all samples, divided into windows (W, K, ...)."""
         n_windows = len(self.is_enough)
         whole = values[: n_windows * self.size]
         return whole.reshape(n_windows, self.size, *values.shape[1:])[
@@ -121,7 +122,7 @@ def split(
     usual_s = 4 * step * interval_s
     is_regular = np.abs(spans_s - usual_s) < _MAX_DEVIATION * usual_s
     is_used = is_regular[: n_windows * size].reshape(n_windows, size)
-    # A window with many gaps has too few samples to determine its nuisances.
+    # A window with many gaps has too few samples for its nuisances.
     is_enough = is_used.sum(axis=1) >= _MIN_SAMPLES // 2
     if is_enough.sum() < _MIN_WINDOWS:
         return None
@@ -129,7 +130,7 @@ def split(
 
 
 class Estimate(NamedTuple):
-    """Estimated unknowns (m,) of a fault and their standard deviations (m,)."""
+    """Estimated unknowns (m,) of a fault, and their standard deviations (m,)."""
 
     values: FloatArray
     sigmas: FloatArray
@@ -142,20 +143,20 @@ class Fit:
     Attributes
     ----------
     blocks : Blocks
-        Normal equations in blocks of time: products of the columns and of the residuals, which are
-        last, divided by the variance of the noise.
+        Normal equations of each block of time: products of the columns and of the residuals (last),
+        divided by the variance of the noise.
     places : dict
         Indices of the columns of each fault. The first entry is the extrinsic.
     weights : (W,) array
         Weights of the windows, divided by the variance of the noise.
     residual : float
-        Root of the median squared residual of a window, if only the extrinsic is estimated.
+        Root of the median squared residual of the windows, if only the extrinsic is estimated.
     remaining : float
-        The same root if all faults are estimated, too.
+        The same value if all faults are also estimated.
     n_samples : float
-        Number of samples; a window with less weight counts less.
+        Number of samples, where a window counts by its weight.
     nuisances : (W, n) array
-        Estimated nuisances of each window, if all faults are estimated, too.
+        Estimated nuisances of each window, if all faults are also estimated.
     """
 
     blocks: Blocks
@@ -190,10 +191,10 @@ class Fit:
         return Estimate(self.joint.values[places], self.joint.sigmas[places])
 
     def biases(self, name: str) -> FloatArray:
-        """Return the bias (m,) of the values of a fault that noise in the columns can cause.
+        """Return the largest bias (m,) of a fault's values by noise in the columns.
 
         Noise in a column reduces its estimate (errors in variables). The noise is assumed to be as
-        large as that of the residuals.
+        large as the residuals.
         """
         information = self.blocks.total[:-1, :-1]
         variances = np.diag(np.linalg.inv(information))
@@ -201,37 +202,37 @@ class Fit:
 
     @property
     def explained_share(self) -> float:
-        """Share of the sum of squared residuals by which the faults reduce it."""
+        """Share by which the faults reduce the sum of squared residuals."""
         without_faults = self._cost(self._extrinsic_columns)
         return 1.0 - self._cost(self._every_column) / max(
             without_faults, 1e-300
         )
 
     def _cost(self, columns: list[int]) -> float:
-        """Return the sum of squared residuals after a fit of some columns."""
-        # The products x' P x of columns and residuals, with x = (-estimate, 1), are this sum.
+        """Return the sum of squared residuals after some columns were fitted."""
+        # The sum is x' P x, with the products P of columns and residuals, and x = (-estimate, 1).
         x = np.append(-self.blocks.solve(columns), 1.0)
         used = [*columns, -1]
         return float(x @ self.blocks.total[np.ix_(used, used)] @ x)
 
     @property
     def open_covariance(self) -> FloatArray:
-        """Covariance (3, 3) that all possible faults add to the extrinsic."""
+        """Covariance (3, 3) that all possible faults together add to the extrinsic."""
         return self.open_to(self._every_column)
 
     def open_to(self, columns: list[int]) -> FloatArray:
         """Return the covariance (3, 3) that the faults of some columns add to the extrinsic.
 
-        If these faults are estimated too, the extrinsic moves, and its covariance grows. The square
-        of the shift and the growth are added. They may concern one direction only, such as the axis
-        about which a machine turns.
+        If these faults are also estimated, the extrinsic shifts, and its covariance grows. The
+        result is the sum of the squared shift and of the growth. It may have a single direction,
+        such as the axis about which a machine turns.
         """
         n_values = len(self._extrinsic_columns)
         shift = self.blocks.solve(columns)[:n_values]
         with_faults = self.blocks.jackknife(columns)[:n_values, :n_values]
         without_faults = self.blocks.jackknife(self._extrinsic_columns)
         variances, axes = np.linalg.eigh(with_faults - without_faults)
-        # Chance makes some variances smaller. They do not grow then, and add nothing.
+        # By chance, some variances become smaller. They add nothing.
         growth = (axes * np.maximum(variances, 0.0)) @ axes.T
         return np.outer(shift, shift) + growth
 
@@ -248,14 +249,14 @@ def fit_columns(
     Parameters
     ----------
     columns : mapping of str to Column
-        The first entry is the extrinsic.
+        Columns of each unknown. The first entry is the extrinsic.
     windows : object
         Argument of the functions of the columns.
     is_used : (W, K) bool array
-        Samples without a gap nearby.
+        Samples that are not near a gap.
     residuals : (W, K, 3) array
     nuisances : (W, K, 3, n) array
-        Columns of the unknowns that each window has for itself.
+        Columns of the unknowns that each window has on its own.
     """
     tables = []
     instruments = []
@@ -271,7 +272,7 @@ def fit_columns(
         information += [column.sigma**-2] * table.shape[3]
         places[name] = list(range(start, len(information)))
     prior = np.diag([*information, 0.0])
-    # Project the nuisances out, by an orthonormal basis of them (W, 3 K, n).
+    # Project the nuisances out, with an orthonormal basis (W, 3 K, n).
     basis, triangle = np.linalg.qr(_flat([nuisances], is_used))
     to_basis = np.swapaxes(basis, 1, 2)
     target = residuals[..., None]
@@ -305,12 +306,12 @@ def fit_columns(
 def _window_weights(
     products: FloatArray, extrinsic: list[int], counts: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Return robust weights (W,) of windows from their residuals after a fit of the extrinsic.
+    """Return robust weights (W,) of windows by their residuals after the extrinsic was fitted.
 
     Parameters
     ----------
     products : (W, p, p) array
-        Products of the columns and, last, the residuals.
+        Products of the columns and of the residuals, which are last.
     extrinsic : list of int
         Columns of the extrinsic.
     counts : (W,) array
@@ -319,7 +320,7 @@ def _window_weights(
     Returns
     -------
     weights : (W,) array
-        Divided by the median squared residual.
+        Weights, divided by the median squared residual.
     usual : float
         Median squared residual.
     """
@@ -338,9 +339,9 @@ def _window_weights(
 
 
 def _flat(tables: list[FloatArray], is_used: BoolArray) -> FloatArray:
-    """Join tables (W, K, 3, m) of columns to one table (W, 3 K, p).
+    """Join tables (W, K, 3, m) of columns into one table (W, 3 K, p).
 
-    Rows of samples that are not used are zero.
+    Rows of unused samples are zero.
     """
     joined = is_used[..., None, None] * np.concatenate(tables, axis=3)
     return np.reshape(joined, (len(joined), -1, joined.shape[3]))

@@ -1,4 +1,4 @@
-"""Findings about a stream that was computed from the other one."""
+"""Findings about a stream that was computed from the other stream."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,14 +6,14 @@ from typing import Any
 
 from hand_eye_calib.core.checks.findings import Finding, Severity, finding
 
-#: Residuals below this share of the median motion are those of a copy, in slow streams.
+#: A slow stream is a copy if its residuals are below this share of the median motion.
 COPIED_SHARE = 0.01
 
 
 def copied(evidence: str, **residual: Any) -> list[Finding]:
     """Return the finding that one stream was computed from the other.
 
-    ``residual`` is the remaining difference of both streams, with its unit in its name.
+    ``residual`` is the difference that remains between both streams. Its unit is in its name.
     """
     return [
         finding(

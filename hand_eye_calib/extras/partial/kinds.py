@@ -35,7 +35,7 @@ from hand_eye_calib.extras.partial.partial import (
     unexplained_path,
 )
 
-# Allowed values of options that only matter for full poses of both sensors.
+# Allowed values of options that matter only if both sensors have full poses.
 _OF_POSES: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
@@ -51,30 +51,31 @@ _OF_ROTATIONS: dict[str, tuple[object, ...]] = {
     "parent_scale": (1.0,),
 }
 
-# Change of the time offset (s) above which positions are paired anew. A smaller change is left to
-# the model of the positions, which estimates the offset better than speeds do.
+# Positions are paired anew if the time offset changes by more than this (s). The noise model of the
+# positions estimates a smaller change better than speeds do.
 _LEAST_CHANGE_OF_POSITIONS_S = 0.05
 
-# Largest time offset (s) that the solve itself is sure to estimate.
+# Largest time offset (s) that the solve can certainly estimate on its own.
 _FOUND_BY_SOLVE_S = 0.25
 
-# Standard deviation of a time offset from correlated rates, in intervals between poses.
+# Standard deviation of a time offset from correlated rates, as a multiple of the interval between
+# poses.
 _COARSE_INTERVALS = 0.2
 
 
-# Time offsets (s) that are tried if speeds are not correlated. The solve estimates the rest.
+# Time offsets (s) that are tried if speeds are not correlated. The solve estimates the remainder.
 _TRIED_OFFSETS_S = tuple(np.round(np.arange(-0.9, 0.95, 0.1), 3).tolist())
-# A tried offset counts if it leaves less than this share of the unexplained path without offset.
+# A tried offset is accepted if it multiplies the unexplained share of the path by less than this.
 _CLEAR_SHARE = 0.5
 
 
 def _solve_positions(
     snapshot: Snapshot, cross_check: bool | None
 ) -> Calibration:
-    """Estimate the lever arm. ``cross_check`` has no effect: positions have no cross-check.
+    """Estimate the lever arm. Positions have no cross-check, so ``cross_check`` has no effect.
 
-    A delay may make positions look unrelated to the poses. The correlation of speeds, or the paths
-    themselves, then estimate the delay, and the solve is repeated.
+    With a delay, positions may look unrelated to the poses. In this case, the delay is estimated
+    from the correlation of speeds or from the paths, and the solve is repeated.
     """
     result = _solve(snapshot, estimate_lever_arm)
     config = snapshot.config
@@ -101,7 +102,7 @@ def _solve_positions(
 
 
 def _shifted(snapshot: Snapshot, offset_s: float) -> Snapshot:
-    """Return the snapshot with a time offset (s) in addition to that of its options."""
+    """Return the snapshot with an additional time offset (s)."""
     known_s = float(snapshot.config.time_offset)
     return replace(
         snapshot,
@@ -113,7 +114,7 @@ def _offset_of_paths(snapshot: Snapshot) -> float:
     """Return the time offset (s) at which a lever arm explains most of the positions.
 
     A long lever arm changes the speed of the antenna so much that speeds are not correlated. The
-    offset is 0 if no offset explains the positions clearly better.
+    result is 0 if no offset explains the positions clearly better.
     """
     shares = {}
     for offset_s in _TRIED_OFFSETS_S:
@@ -128,7 +129,7 @@ def _offset_of_paths(snapshot: Snapshot) -> float:
 
 
 def _is_unrelated(calibration: Calibration) -> bool:
-    """Return whether a result has the finding that the streams are unrelated."""
+    """Return whether the streams of a result are unrelated, according to its findings."""
     return any(found.code == "unrelated" for found in calibration.findings)
 
 
@@ -145,9 +146,9 @@ def _solve_rotations(
 def _solve(
     snapshot: Snapshot, estimate: Callable[..., Calibration]
 ) -> Calibration:
-    """Estimate the extrinsic; pair the streams anew and repeat if the time offset is large.
+    """Estimate the extrinsic. If the time offset is large, pair the streams anew and repeat.
 
-    An estimated time offset that changes by more than ``UNASKED_S`` is rejected.
+    A change of the time offset by more than ``UNASKED_S`` is rejected.
     """
     config = snapshot.config
     result = estimate(snapshot.pose_pairs, config)
@@ -157,8 +158,8 @@ def _solve(
         return replace(result, time_offset_s=before_s)
     if len(snapshot.kept) or not change_s > MOST_MOVED_S:
         return result
-    # Pairing interpolates the poses. The solve only moved them along their velocity, which is exact
-    # for small offsets only.
+    # Pairing interpolates the poses. The solve only moved them along their velocity, which is
+    # correct for small offsets.
     config = replace(config, time_offset=result.time_offset_s)
     pose_pairs = replace(snapshot, config=config).pose_pairs
     return (
@@ -173,17 +174,18 @@ def check(
 ) -> CheckResult:
     """Check two streams without full poses of both sensors.
 
-    The returned findings include those of the calibration.
+    The result includes the findings of the calibration.
 
     Parameters
     ----------
     snapshot : Snapshot
     calibration : Calibration, optional
-        A result from these streams. Its time offset and scale are not checked again.
+        Result from these streams. Its time offset and scale are not checked again.
     """
     findings = [*calibration.findings] if calibration else []
     known_s = float(snapshot.resolved.config.time_offset)
-    # Pairs of a stored session may have gaps that its streams did not have: they are not checked.
+    # Pairs of a stored session may have gaps that the streams did not have, so they are not
+    # checked.
     if not len(snapshot.kept):
         findings += _check_aligned(snapshot, calibration, known_s)
     hidden = calibration.hidden if calibration else []
@@ -200,20 +202,20 @@ def check(
             findings += of_solve
     if hidden and not any(issue.makes_unusable for issue in findings):
         findings.append(unobservable_axes(hidden))
-    # Lengths in another unit come first: they cause the findings of the solve.
+    # Lengths in another unit come first, because they cause the findings of the solve.
     findings.sort(key=lambda issue: issue.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))
 
 
 def _has(findings: Sequence[Finding], code: str) -> bool:
-    """Whether a finding has this code."""
+    """Return whether a finding has this code."""
     return any(issue.code == code for issue in findings)
 
 
 def _explained(findings: list[Finding], by: Sequence[Finding]) -> list[Finding]:
-    """Return findings together with those that explain them.
+    """Return findings with their causes.
 
-    The causes replace the finding that the streams are unrelated, if there are any.
+    If there are causes, they replace the finding that the streams are unrelated.
     """
     if by:
         findings = [issue for issue in findings if issue.code != "unrelated"]
@@ -251,7 +253,7 @@ def _check_aligned(
 
 
 def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
-    """Return the findings in their order, equal findings once."""
+    """Return the findings in their order, without repetitions."""
     different: list[Finding] = []
     for issue in findings:
         if issue not in different:
@@ -260,7 +262,7 @@ def _without_repetitions(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _least_lever_arm(calibration: Calibration) -> float:
-    """Return the smallest length (m) of the lever arm that its uncertainty allows."""
+    """Return the smallest length (m) of the lever arm that is compatible with its uncertainty."""
     sigmas = np.sqrt(np.diag(calibration.covariance_measured))[:3]
     is_hidden = [axis in calibration.hidden for axis in "xyz"]
     observed_sigmas = np.where(is_hidden, np.inf, sigmas)
@@ -270,7 +272,7 @@ def _least_lever_arm(calibration: Calibration) -> float:
 def _check_clock(
     parent: Trajectory, child: Trajectory, known_s: float, snapshot: Snapshot
 ) -> list[Finding]:
-    """Detect a clock offset by the correlation of speeds or angular rates, if it is clear."""
+    """Return the finding about a clock offset, if speeds or angular rates correlate clearly."""
     uses_speeds = kind_of(snapshot.config).is_timed_by_speed
     max_gap_s = snapshot.config.max_gap
     correlation = correlate_rates(

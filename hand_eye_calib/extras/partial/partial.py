@@ -49,29 +49,30 @@ from hand_eye_calib.extras.partial.rotation_checks import (
 )
 from hand_eye_calib.extras.partial.rotation_columns import fit_pairs
 
-# Share of the path of the positions that the poses do not explain: above this, a fault is searched.
-# Two sensors on one body have at most 0.05.
+# A fault is searched for if the poses leave more than this share of the positions' path
+# unexplained. Two sensors on one body have at most 0.05.
 _SUSPECT_PATH = 0.1
-# The same share above which both streams are unrelated. Sensors on two bodies have 0.5 and more.
+# The streams are unrelated if this share is larger. Sensors on two bodies have 0.5 and more.
 _UNRELATED_PATH = 0.3
-# Unexplained share of the rotation above which rotations or rates are unrelated.
+# Rotations or rates are unrelated if more than this share of the rotation is unexplained.
 _UNRELATED_ROTATION = 0.5
 
 # Number of poses that a motion spans in the comparison of the rotations of both streams.
 _SPAN = 10
 
-# A scale explains a path if it reduces the unexplained share at least by this factor.
+# A scale explains a path if it reduces the unexplained share to this multiple or less.
 _MENDED_PATH = 0.5
 
-# Number of standard deviations above which a scale between the streams is reported.
+# A scale between the streams is reported above this number of standard deviations.
 _SCALE_SIGMAS = 5.0
-# Smallest share of the information on a reported scale that is from the data, not from the prior.
+# Smallest share of the information on a reported scale that comes from the data instead of the
+# prior.
 _MIN_DATA_SHARE = 0.5
-# Smallest scale to divide by.
+# Smallest scale that is used as a divisor.
 _LEAST_SCALE = 1e-3
 
-# Standard deviation (m) along each axis of the point that a sensor refers to: the origin of an
-# odometry, or the centre of an antenna or a prism.
+# Standard deviation (m) along each axis of a sensor's reference point: the origin of an odometry,
+# or the centre of an antenna or a prism.
 _POINT_M = 0.005
 
 
@@ -79,7 +80,7 @@ _POINT_M = 0.005
 class _Paths:
     """Poses (N, 4, 4) and positions (N, 3) at the same stamps (N,).
 
-    ``is_child`` is whether the child measures the positions.
+    ``is_child`` states whether the child measures the positions.
     """
 
     stamps_ns: IntArray
@@ -89,7 +90,7 @@ class _Paths:
 
     @classmethod
     def of(cls, pose_pairs: PosePairs, config: CalibratorConfig) -> "_Paths":
-        """Return the paths of synchronised streams, of which one measures positions."""
+        """Return the paths of two synchronised streams, one of which measures positions."""
         parent = pose_pairs.Ts_pw_p
         child = pose_pairs.child_scaled(config.given_scale).Ts_cw_c
         if config.child_measures == "positions":
@@ -107,7 +108,7 @@ class _Paths:
         )
 
     def solve(self, with_scale: bool) -> of_positions.LeverArmSolution:
-        """Estimate the lever arm, and the scale if asked for."""
+        """Estimate the lever arm, and on request the scale."""
         return of_positions.solve(
             self.stamps_ns, self.poses, self.positions, with_scale
         )
@@ -115,7 +116,7 @@ class _Paths:
     def unexplained_share(
         self, solution: of_positions.LeverArmSolution
     ) -> float:
-        """Return the share of the path of the positions that a lever arm does not explain."""
+        """Return the share of the positions' path that a lever arm leaves unexplained."""
         return position_windows.unexplained_share(
             self.poses, self.positions, solution.lever_arm, solution.scale
         )
@@ -123,7 +124,7 @@ class _Paths:
     def without_smoothing(
         self, solution: of_positions.LeverArmSolution
     ) -> tuple[of_positions.LeverArmSolution, FloatArray]:
-        """Return the solution without the effect of estimated smoothing.
+        """Return the solution, corrected for the estimated smoothing of the positions.
 
         The second value is the covariance (3, 3), m^2, that possible faults add to the lever arm.
         """
@@ -135,7 +136,7 @@ class _Paths:
             return solution, np.zeros((3, 3))
         smoothing = fitted.smoothing
         by_response = solution.by_response
-        # Smoothing c is a response of -c.
+        # A smoothing c acts like a response of -c.
         lever_arm = solution.lever_arm - smoothing.mean_s2 * by_response
         of_smoothing = smoothing.variance_s4 * np.outer(
             by_response, by_response
@@ -146,12 +147,12 @@ class _Paths:
         )
 
     def child_scale(self, scale: float) -> float:
-        """Return the scale of the child for a scale of the positions."""
+        """Return the scale of the child that corresponds to a scale of the positions."""
         return scale if self.is_child else 1.0 / scale
 
 
 def unexplained_path(pose_pairs: PosePairs, config: CalibratorConfig) -> float:
-    """Return the share of the path of the positions that the best lever arm does not explain."""
+    """Return the share of the positions' path that the best lever arm leaves unexplained."""
     paths = _Paths.of(pose_pairs, config)
     return position_windows.unexplained_at_start(paths.poses, paths.positions)
 
@@ -161,13 +162,13 @@ def estimate_lever_arm(
 ) -> Calibration:
     """Solve and assess synchronised poses and positions.
 
-    The result has no frame names. Its rotation is the identity, and unknown.
+    The result has no frame names. Its rotation is unknown, and set to the identity.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock: the time offset of the options is applied already. The orientations of the
-        sensor that measures positions are ignored.
+        Poses on one clock: the time offset of the options is already applied. The orientations of
+        the sensor that measures positions are ignored.
     config : CalibratorConfig
 
     Raises
@@ -177,7 +178,7 @@ def estimate_lever_arm(
     """
     stamps_ns = pose_pairs.stamps_ns
     paths = _Paths.of(pose_pairs, config)
-    # From the lever arm of the sensor with positions to the extrinsic and to the child's clock.
+    # Convert the lever arm of the sensor with positions to the extrinsic and to the child's clock.
     sign = 1.0 if paths.is_child else -1.0
     try:
         solution = paths.solve(config.scale in ("auto", "estimate"))
@@ -217,10 +218,10 @@ def estimate_lever_arm(
 
 
 def _allowance(paths: _Paths, config: CalibratorConfig) -> FloatArray:
-    """Return the covariance (6, 6) of constant errors that no recording reveals.
+    """Return the covariance (6, 6) of constant errors, which no recording reveals.
 
     The reference point of a sensor is uncertain, unless its stream is exact. Poses that are not
-    exact also add the distance that the sensor travels in ``FLOOR_TRAVEL_S``, as for full poses.
+    exact add the distance that the sensor travels in ``FLOOR_TRAVEL_S``, as for full poses.
     """
     kind_of_poses = config.parent_kind
     kind_of_positions = config.child_kind
@@ -243,8 +244,8 @@ def _step_residuals(
 ) -> Residuals:
     """Return the residuals of the distances between consecutive positions.
 
-    A residual is the predicted minus the measured distance (m), as a vector along the predicted
-    step, in the axes of the sensor with poses. The rotation of the world does not matter.
+    A residual is the predicted minus the measured distance (m). It is a vector along the predicted
+    step, in the axes of the sensor with poses. So the rotation of the world does not matter.
     """
     rotations = se3.rotation_of(paths.poses)
     steps = np.diff(
@@ -269,7 +270,7 @@ def _check_path(
     paths: _Paths,
     is_scale_given: bool,
 ) -> tuple[Finding, ...]:
-    """Detect positions in other units, of another scale, or on another path than the odometry."""
+    """Detect positions with another unit or scale, or on another path than the odometry."""
     share = paths.unexplained_share(solution)
     if share < _SUSPECT_PATH:
         if is_scale_given:
@@ -316,7 +317,7 @@ def _check_scale(
 ) -> tuple[Finding, ...]:
     """Detect a scale between the streams that is larger than the error of an odometry.
 
-    The estimated scale has a prior of 1 with ``prior_sigma``. Its effect is removed here.
+    The estimate has a prior of 1 with ``prior_sigma``. The effect of this prior is removed here.
     """
     data_share = 1.0 - (solution.scale_sigma / prior_sigma) ** 2
     if data_share < _MIN_DATA_SHARE:
@@ -339,12 +340,13 @@ def estimate_rotation(
 ) -> Calibration:
     """Solve and assess synchronised rotations.
 
-    The result has no frame names. Its translation is zero, and unknown.
+    The result has no frame names. Its translation is unknown, and set to zero.
 
     Parameters
     ----------
     pose_pairs : PosePairs
-        On one clock: the time offset of the options is applied already. Positions are ignored.
+        Poses on one clock: the time offset of the options is already applied. Positions are
+        ignored.
     config : CalibratorConfig
     cross_check : bool
         Whether to compare the result with robust least squares of the same rotations.
@@ -396,7 +398,7 @@ def _open_covariance(
 ) -> FloatArray:
     """Return the covariance (6, 6) that possible faults add to the rotation, rad^2.
 
-    It refers to a perturbation in the axes of the child. The translation has zeros.
+    The covariance is of a perturbation in the axes of the child. The translation has zeros.
     """
     whole = np.zeros((6, 6))
     rotation = se3.rotation_of(T_parent_child)
@@ -412,7 +414,7 @@ def _open_covariance(
 
 
 def _rotations_of(Ts: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) with the same rotations and zero translations."""
+    """Return poses (N, 4, 4) with the same rotations and zero translations."""
     return se3.from_rotation_translation(se3.rotation_of(Ts), np.zeros(3))
 
 
@@ -424,8 +426,8 @@ def _solve_rotation(
 ) -> tuple[adaptive_estimator.AdaptiveSolution, FloatArray]:
     """Estimate the rotation; return the solution, and the child's poses without a rate bias.
 
-    The noise is fitted to increments of up to some seconds. Their change by a bias is linear only
-    for a small bias, so a first solve removes most of it.
+    The noise is fitted to increments of up to some seconds. A bias changes them linearly only if it
+    is small, so a first solve removes most of it.
     """
     solve = partial(
         adaptive_estimator.solve, stamps_ns, Ts_pw_p, is_clock_free=True
@@ -445,9 +447,9 @@ def _solve_rotation(
 def _rate_bias(
     solution: adaptive_estimator.AdaptiveSolution, config: CalibratorConfig
 ) -> RateBias:
-    """Return the bias of the rates, in the axes of the sensor that has it.
+    """Return the bias of the rates, in the axes of the sensor with the bias.
 
-    Two gyroscopes reveal only the difference of their biases, the child's less the parent's.
+    Two gyroscopes reveal only the difference of their biases: child minus parent.
     """
     bias, sigmas = solution.rate_bias
     of = (
@@ -468,7 +470,7 @@ def _rate_bias(
 def _check_rotation(
     Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, T_parent_child: FloatArray
 ) -> tuple[Finding, ...]:
-    """Detect streams whose rotations differ too much after the extrinsic is applied."""
+    """Detect streams whose rotations differ too much under the estimated extrinsic."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
     residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)

@@ -35,38 +35,39 @@ from hand_eye_calib.extras.partial.position_windows import unexplained_share
 from hand_eye_calib.extras.partial.positions import solve
 from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
-# A coordinate of a lever arm is zero if it is below this distance (m).
+# A coordinate of a lever arm counts as zero if its size is below this (m).
 _ZERO_M = 0.005
 
-# The upper bound of a coordinate is its size plus two standard deviations.
-# Two housings hardly fit if the upper bounds of two coordinates are below this distance (m).
+# Two housings hardly fit if two coordinates of the lever arm are below this (m). A coordinate is
+# compared by its upper bound, which is its size plus two standard deviations.
 _HOUSING_M = 0.03
-# Largest upper bound (m) of a zero coordinate. With fewer than two coordinates below, the lever arm
-# is too uncertain to be zero, and there is no finding. With all three, the finding can be an error.
+# Largest upper bound (m) of a coordinate that counts as zero. If less than two coordinates are
+# below, the lever arm is too uncertain for a finding. If all three are below, the finding can be an
+# error.
 _UNCERTAIN_M = 0.06
 
-# Median residual (m) below which positions were computed from the poses: no receiver or total
+# Positions with a smaller median residual (m) were computed from the poses: no receiver or total
 # station measures to a twentieth of a millimetre.
 _COPIED_M = 5e-5
 
-# Number of standard deviations above which smoothing is an error, and a late coordinate is
-# reported. A jackknife of at most 16 blocks estimates them, so their ratio has heavy tails.
+# Smoothing is an error, and a late coordinate is reported, above this number of standard
+# deviations. A jackknife of at most 16 blocks estimates them, so the ratio has heavy tails.
 _CLEAR_SIGMAS = 6.0
-# Number of standard deviations above which smoothing is a warning. The limit is lower, because
-# smoothing is less certain on a drone: it tilts as it accelerates, so that a vertical lever arm
-# acts nearly like smoothing.
+# Smoothing is a warning above this number of standard deviations. On a drone it is less certain, so
+# the limit is lower: a drone tilts as it accelerates, so that a vertical lever arm acts nearly like
+# smoothing.
 _LIKELY_SIGMAS = 3.3
-# Smallest smoothing of positions that is an error (s^2): that of a filter of 0.13 s. Streams
-# without a filter have up to 0.006 (simulated machines with seeds 77 and 78, and NTU VIRAL).
+# Smallest smoothing of positions (s^2) that is an error: the effect of a filter of 0.13 s. Without
+# a filter, streams have up to 0.006 (simulated machines with seeds 77 and 78, and NTU VIRAL).
 _SMOOTHING_S2 = 0.008
-# Smallest delay (s) of a coordinate against the others that is reported.
+# Smallest reported delay (s) of a coordinate after the others.
 _LAG_S = 0.02
-# If the positions are on another path than the poses, a fault is reported as the reason only if the
+# If the positions are on another path than the poses, a fault is reported as the cause only if the
 # faults explain at least this share of the squared residuals.
 _MIN_EXPLAINED_SHARE = 0.6
 
-# A path is mirrored if, after the sign of z is changed, a lever arm leaves less than this share of
-# the path unexplained.
+# A path is mirrored if a lever arm leaves less than this share of the path unexplained after the
+# sign of z was changed.
 _MAX_UNEXPLAINED_IF_MIRRORED = 0.1
 
 
@@ -82,7 +83,7 @@ def check_solved(
     Parameters
     ----------
     parent, child : Trajectory
-        Each on its own clock.
+        Streams, each on its own clock.
     calibration : Calibration
         The result from both streams.
     config : CalibratorConfig
@@ -119,9 +120,9 @@ def _check_moving(
     is_unrelated: bool,
     interpolated: list[Finding],
 ) -> list[Finding]:
-    """Check positions against the lever arm; return the findings of the first check that fails.
+    """Check positions against the lever arm; return the findings of the first failed check.
 
-    ``interpolated`` are the findings of the check for interpolated positions.
+    ``interpolated`` has the findings about interpolated positions.
     """
     lever_arm = se3.translation_of(calibration.T_parent_child)
     sigmas = calibration.sigmas_measured[:3]
@@ -155,7 +156,8 @@ def _is_mirrored(
 ) -> bool:
     """Return whether a lever arm explains the positions after the sign of z is changed.
 
-    The sign of any coordinate gives the same path up to a rotation, so z stands for all three.
+    A change of the sign of x or y leads to the same mirrored path, up to a rotation. So only z is
+    tried.
     """
     mirrored = positions * [1.0, 1.0, -1.0]
     try:
@@ -169,7 +171,7 @@ def _is_mirrored(
 
 
 def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
-    """Return whether the residuals are so small that positions were computed from the poses."""
+    """Return whether the positions were computed from the poses, because the residuals are tiny."""
     steps = np.diff(positions, axis=0)
     moved_m = median(np.linalg.norm(steps, axis=1))
     return fitted.residual < min(_COPIED_M, COPIED_SHARE * moved_m)
@@ -178,14 +180,14 @@ def _is_copied(fitted: PositionFit, positions: FloatArray) -> bool:
 def check_position(
     lever_arm: FloatArray, sigmas: FloatArray, priors: Collection[str]
 ) -> list[Finding]:
-    """Detect a lever arm of zero, which suggests that positions were copied between the streams.
+    """Detect a lever arm of zero, a sign that positions were copied between the streams.
 
     Parameters
     ----------
     lever_arm, sigmas : (3,) array
-        Lever arm and its standard deviations (m), infinite for unobservable axes.
+        Lever arm and its standard deviations (m). Unobservable axes have infinite values.
     priors : collection of str
-        Axes with a prior; they are not checked.
+        Axes with a prior. They are not checked.
     """
     axes = [
         k
@@ -203,7 +205,7 @@ def check_position(
     uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
     if uppers_m[1] > _UNCERTAIN_M:
         return []
-    # Two axes are not enough for an error: an antenna may be right above the other sensor.
+    # Two axes do not suffice for an error: an antenna may be directly above the other sensor.
     is_sure = (
         len(axes) == 3
         and uppers_m[1] < _HOUSING_M
@@ -226,7 +228,7 @@ def check_position(
 def check_positions(
     fitted: PositionFit, stream: str, is_unrelated: bool
 ) -> list[Finding]:
-    """Detect the fault of a stream of positions that is most significant.
+    """Detect the most significant fault of a stream of positions.
 
     Parameters
     ----------
@@ -235,8 +237,8 @@ def check_positions(
     stream : {"parent", "child"}
         The stream of positions.
     is_unrelated : bool
-        Whether the positions are on another path than the poses. A fault is reported then only if
-        it explains why.
+        Whether the positions are on another path than the poses. A fault is then reported only if
+        it explains this.
 
     Returns
     -------
@@ -254,9 +256,9 @@ def check_positions(
 
 
 def _smoothing(fitted: PositionFit, stream: str) -> Suspect:
-    """Test whether positions are smoothed.
+    """Return the test for smoothed positions.
 
-    Significant smoothing is an error, because the lever arm follows from the positions in turns.
+    Significant smoothing is an error: in turns, it biases the lever arm.
     """
     values, sigmas = fitted.estimate("smoothing")
     smoothing_s2 = float(values[0])
@@ -279,12 +281,12 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> Suspect:
     """Test whether a coordinate has another scale than the others.
 
     Drift and noise of the odometry reduce the estimated scale of a coordinate that hardly changes.
-    A scale that is too small by no more than this bias is not reported. The exception is a
-    coordinate that does not change at all: it was not measured.
+    If this bias explains a scale that is too small, the scale is not reported. Exception: a
+    coordinate that does not change at all was not measured.
     """
     axis, size, sigma = largest_deviation(*fitted.estimate("scales"))
     noise = 3.0 * fitted.residual**2 * (1.0 - fitted.explained_share)
-    # The drift is that of an odometry over the distance from the mean position.
+    # Drift of an odometry over the distance from the mean position.
     spurious = (agreement.DRIFT_SHARE * fitted.path_m) ** 2 + noise
     max_bias = agreement.BIASES * spurious / fitted.spreads_m[axis] ** 2
     if -max_bias < size < 0.0 and not fitted.is_constant[axis]:
@@ -297,7 +299,7 @@ def _scale_of_axis(fitted: PositionFit, stream: str) -> Suspect:
 
 
 def _lag_of_axis(fitted: PositionFit, stream: str) -> Suspect:
-    """Test whether a coordinate is late against the others."""
+    """Test whether a coordinate is later than the others."""
     axis, lag_s, sigma_s = largest_deviation(*fitted.estimate("delays"))
     n_sigmas = lag_s / sigma_s
     if lag_s < _LAG_S or n_sigmas < _CLEAR_SIGMAS:

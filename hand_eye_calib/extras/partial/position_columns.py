@@ -4,17 +4,17 @@ In a window of some seconds, the measured positions are
 
     q_i = A (R_i l + t_i) + a + sum_k f_k c_ki + noise
 
-with the poses (R_i, t_i) of the odometry, the lever arm l, and the pose (A, a) of the world of the
-odometry in the world of the positions. Errors of (A, a) are projected out of each window. The
-column c_k is what a fault of size f_k = 1 adds: the coordinate for a wrong scale of an axis, minus
-the velocity for a delay d, the acceleration for smoothing c. The last two follow from the frequency
-response of any low-pass filter at low angular frequencies w, ``1 - i w d - w^2 c``.
+(R_i, t_i) are the poses of the odometry, l is the lever arm, and (A, a) is the pose of the
+odometry's world in the world of the positions. Errors of (A, a) are projected out of each window.
+The column c_k is the effect of a fault of size f_k = 1: the coordinate for a wrong scale of an
+axis, minus the velocity for a delay d, the acceleration for smoothing c. The last two follow from
+the frequency response of any low-pass filter at low angular frequencies w, ``1 - i w d - w^2 c``.
 
-Accelerations are computed from the poses. The accelerations of the measured positions are their
-instrument: the noise of both is independent, so that neither noise nor drift looks like smoothing.
+Accelerations are computed from the poses. Their instrument is the acceleration of the measured
+positions. The noise of both is independent, so neither noise nor drift looks like smoothing.
 
-Smoothing that is too weak for a finding still moves the lever arm of a drone. Its prior has two
-parts, one of usual and one of faulty streams. Bayes' rule returns its mean and its variance.
+Smoothing that is too weak for a finding still shifts the lever arm of a drone. Its prior has two
+parts: usual streams and faulty streams. Bayes' rule yields its mean and its variance.
 """
 
 from dataclasses import dataclass
@@ -35,32 +35,34 @@ from hand_eye_calib.extras.partial.columns import (
     split,
 )
 
-# Duration of a window (s): long enough for a turn, short enough for little drift of an odometry.
+# Duration (s) of a window. It is long enough for a turn, and short enough for little drift of an
+# odometry.
 _WINDOW_S = 10.0
 
-# Step (s) of the finite differences for velocities and accelerations. If the interval between
-# positions is longer, the interval is the step.
+# Step (s) of the finite differences for velocities and accelerations. A longer interval between
+# positions replaces it.
 _STEP_S = 0.2
 
-# Prior of smoothing: its standard deviation (s^2) for faulty streams, and their share. Chosen on
-# simulated machines with filters of 0.05 to 0.2 s. Usual streams have that of the noise model.
+# Prior standard deviation of the smoothing (s^2) of faulty streams. Chosen on simulated machines
+# with filters of 0.05 to 0.2 s. Usual streams have the prior of the noise model.
 _FAULTY_S2 = 0.01
+# Share of faulty streams.
 _FAULTY_SHARE = 0.2
 
-# Largest range (m) of a coordinate that is constant, for rounding.
+# A coordinate with a smaller range (m) is constant, up to rounding.
 _MAX_CONSTANT_M = 1e-6
 
 
 class _Windows(NamedTuple):
     """W windows of K predicted and measured positions, in axes of the world of the positions.
 
-    The predicted positions are those of the lever arm's end along the poses. Each window of them is
-    rotated to fit the measured positions best.
+    A predicted position is the end of the lever arm on the poses. The predicted positions of each
+    window are rotated to fit the measured positions.
 
     Attributes
     ----------
     is_used : (W, K) bool array
-        Positions without a gap nearby.
+        Positions that are not near a gap.
     rotations : (W, K, 3, 3) array
         Rotations of the sensor with poses.
     path : (W, K, 3) array
@@ -110,7 +112,7 @@ class PositionFit(Fit):
     path_m : float
         Root mean square distance of the predicted positions from the mean of their window.
     spreads_m : (3,) array
-        Root mean square distance along each coordinate, without the motion that other columns
+        Root mean square distance along each coordinate, after subtraction of what other columns
         explain.
     speeds_m_s : (3,) array
         Root mean square of the predicted velocity along each coordinate.
@@ -126,13 +128,13 @@ class PositionFit(Fit):
 
     @property
     def smoothing(self) -> "Smoothing":
-        """Smoothing of the positions, by the data and the prior."""
+        """Smoothing of the positions, from the data and the prior."""
         values, sigmas = self.estimate("smoothing")
         return posterior_smoothing(float(values[0]), float(sigmas[0]))
 
     @property
     def open_covariance(self) -> FloatArray:
-        """Covariance (3, 3) that all possible faults but smoothing add to the lever arm."""
+        """Covariance (3, 3) that all possible faults except smoothing add to the lever arm."""
         of_smoothing = self.places["smoothing"]
         others = [
             place for place in self._every_column if place not in of_smoothing
@@ -150,14 +152,14 @@ class Smoothing(NamedTuple):
 def posterior_smoothing(
     smoothing_s2: float, sigma_s2: float, tuning: Tuning = TUNING
 ) -> Smoothing:
-    """Return the smoothing given its estimate and the prior.
+    """Return the smoothing, given its estimate and the prior.
 
     Parameters
     ----------
     smoothing_s2, sigma_s2 : float
         Estimate and its standard deviation.
     tuning : Tuning
-        Its last prior of positions is that of the smoothing of usual streams.
+        Constants. The last prior of positions is that of the smoothing of usual streams.
     """
     usual_s2 = tuning.of_positions[-1]
     prior_variances = np.array([usual_s2**2, _FAULTY_S2**2])
@@ -187,9 +189,9 @@ def fit_positions(
     poses : (N, 4, 4) array
         Poses of the other sensor.
     positions : (N, 3) array
-        At the same stamps, in the same unit.
+        Positions at the same stamps, in the same unit.
     lever_arm : (3,) array
-        Best estimate, m. The values of the regression are relative to this estimate.
+        Best estimate, m. The regression estimates a correction of it.
 
     Returns
     -------
@@ -201,12 +203,12 @@ def fit_positions(
     if windows is None:
         return None
     is_used = windows.is_used
-    # Columns for errors of the pose of the odometry's world: of its translation a, then of its
+    # Columns for errors of the pose of the odometry's world: first its translation a, then its
     # rotation A.
     translation = np.broadcast_to(np.eye(3), windows.rotations.shape)
     world = np.concatenate([translation, se3.skew(windows.path)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, windows.residuals, world)
-    # Information of each column that no other column explains.
+    # Information that each column has alone, not shared with other columns.
     information = 1.0 / np.abs(
         np.diag(np.linalg.inv(fitted.blocks.total[:-1, :-1]))
     )
@@ -252,7 +254,7 @@ def _windows(
     is_used = in_windows.is_used
     path = _centred(in_windows(predicted), is_used)
     measured = _centred(in_windows(positions), is_used)
-    # Rotation of each window that fits the predicted to the measured positions best (Kabsch).
+    # Rotation that fits the predicted to the measured positions of each window best (Kabsch).
     products = np.einsum("wki,wkj,wk->wij", measured, path, is_used)
     to_world = se3.nearest_rotation(products)[:, None]
     path = se3.times(to_world, path)
@@ -268,7 +270,7 @@ def _windows(
 
 
 def _centred(vectors: FloatArray, is_used: BoolArray) -> FloatArray:
-    """Return vectors (W, K, 3) minus the mean of the used vectors of their window."""
+    """Return vectors (W, K, 3) minus the mean of the used vectors in their window."""
     counts = is_used.sum(axis=1)[:, None]
     means = (vectors * is_used[..., None]).sum(axis=1) / counts
     return vectors - means[:, None]

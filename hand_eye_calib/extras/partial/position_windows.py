@@ -9,33 +9,33 @@ from hand_eye_calib.core.base.stats import robust_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 
-# Largest number of steps of the start.
+# Largest number of steps for the starting values.
 _START_STEPS = 50
-# The start ends if the lever arm changes by less than this (m).
+# The steps end if the lever arm changes by less than this (m).
 _START_SETTLED_M = 1e-6
-# Prior information for a lever arm of zero at the start, as a share of that of an axis: for motion
-# that does not reveal the lever arm.
+# Prior information for a lever arm of zero, as a share of the information on an axis. It is for
+# motion that does not reveal the lever arm.
 _PULL_TO_ZERO = 1e-6
 
-# Number of parts of a recording whose paths are compared on their own.
+# Number of parts of a recording whose paths are compared separately.
 _PATH_PARTS = 10
 
 
 def fit_windows(
     Ts_pw_p: FloatArray, positions: FloatArray, with_scale: bool, window: int
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Fit windows of the recording, each aligned on its own, with robust weights.
+    """Align each window of the recording on its own, with robust weights.
 
-    The model in a window is ``scale A^T p = R lever_arm + t`` with the position p, the alignment A
-    of the window, and the pose (R, t). Positions are rows in the code: ``p^T A``.
+    The model in a window is ``scale A^T p = R lever_arm + t``: p is the position, A the alignment
+    of the window, and (R, t) the pose. Positions are rows in the code: ``p^T A``.
 
     Returns
     -------
     lever_arm : (3,) array
     scale : float
-        1 unless asked for.
+        Scale; 1 unless it is estimated.
     orientations : (N, 3, 3) array
-        Of the other sensor in the world of the positions, window by window.
+        Orientations of the other sensor in the world of the positions, window by window.
     """
     lever_arm = np.zeros(3)
     scale = 1.0
@@ -55,7 +55,7 @@ def fit_windows(
             scales = np.divide(
                 products, squares, np.zeros_like(products), where=squares > 0.0
             )
-            # Paths that do not move have no scale.
+            # Paths without motion have no scale.
             scale = float(np.median(scales)) or 1.0
         residuals = scale * rotated - path
         errors = np.sqrt(
@@ -84,10 +84,10 @@ def fit_windows(
 def unexplained_at_start(
     Ts_pw_p: FloatArray, positions: FloatArray, tuning: Tuning = TUNING
 ) -> float:
-    """Return the share of the path that the lever arm of the start does not explain.
+    """Return the share of the path that the lever arm of the starting values does not explain.
 
-    The lever arm of the start ignores the noise model, so it is fast. The scale is 1. The arguments
-    are those of :func:`unexplained_share`.
+    The starting values ignore the noise model, so they are fast to compute. Their scale is 1 here.
+    The arguments are those of :func:`unexplained_share`.
     """
     lever_arm, scale, _ = fit_windows(Ts_pw_p, positions, False, tuning.window)
     return unexplained_share(Ts_pw_p, positions, lever_arm, scale)
@@ -99,7 +99,7 @@ def unexplained_share(
     lever_arm: FloatArray,
     scale: float,
 ) -> float:
-    """Return the share of the path of positions that poses and a lever arm do not explain.
+    """Return the share of the positions' path that poses and a lever arm do not explain.
 
     The share is the median over tenths of the recording, each aligned on its own.
 
@@ -109,12 +109,12 @@ def unexplained_share(
     positions : (N, 3) array
     lever_arm : (3,) array
     scale : float
-        Of the positions.
+        Scale of the positions.
 
     Returns
     -------
     float
-        1 if nothing moves.
+        Share; 1 if nothing moves.
     """
     predicted = se3.rotation_of(Ts_pw_p) @ lever_arm + se3.translation_of(
         Ts_pw_p
@@ -129,12 +129,12 @@ def unexplained_share(
 
 
 def _windows(values: FloatArray, size: int) -> FloatArray:
-    """Values (n, size, ...) of windows of values (N, ...), minus the mean of their window."""
+    """Return values (n, size, ...) of windows of (N, ...), minus the mean of each window."""
     whole = len(values) // size * size
     windows = values[:whole].reshape(-1, size, *values.shape[1:])
     return windows - windows.mean(axis=1, keepdims=True)
 
 
 def _rotations(measured: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Rotations (n, 3, 3) from predicted to measured positions (n, k, 3) of centred windows."""
+    """Return rotations (n, 3, 3) from predicted to measured positions (n, k, 3) in windows."""
     return se3.nearest_rotation(np.einsum("nki,nkj->nij", measured, predicted))

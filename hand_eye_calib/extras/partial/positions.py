@@ -4,20 +4,21 @@ The odometry of the other sensor has the poses (R_i, t_i). The measured position
 
     q_i = W_i (R_i l + t_i) + o_i + white noise
 
-with the lever arm l and the pose (W_i, o_i) of the odometry's world in the world of the positions,
+l is the lever arm. (W_i, o_i) is the pose of the odometry's world in the world of the positions,
 which drifts. The orientations Q_i = W_i R_i are latent: their error is white without bounds, and
-they change from pose to pose as the odometry does, up to its drift. This is the state space of the
+they change from pose to pose like the odometry, up to its drift. This is the state space of the
 adaptive estimator (:mod:`~hand_eye_calib.core.noise.state_space`, docs/adaptive.md) for X = (I, l).
 The orientations are updated from the positions until they settle. The search starts from windows of
 the recording, each aligned on its own.
 
-Errors that act like a lever arm are parameters beside it, with the prior of usual sensors: a scale
-and a direction of the odometry's path, and a time offset. A drone tilts to accelerate. Positions
-with a response kappa (s^2) to acceleration, for instance smoothed ones, move the vertical lever arm
-by kappa g. This model cannot estimate the response well: above about 0.8 Hz the accelerations of a
-drone are mostly noise of the odometry, which looks like smoothed positions. The response is only in
-the covariance here, and :attr:`LeverArmSolution.by_response` is the change of the lever arm for a
-response that :mod:`~hand_eye_calib.extras.partial.position_columns` estimates.
+Errors that act like a lever arm are parameters, too, with the prior of usual sensors: scale and
+direction of the odometry's path, and a time offset. Positions may also respond to acceleration with
+a factor kappa (s^2), for instance if they are smoothed. A drone tilts to accelerate, so the
+response shifts the vertical lever arm by kappa g. This model cannot estimate kappa well: above
+about 0.8 Hz the accelerations of a drone are mostly noise of the odometry, which looks like
+smoothed positions. Here the response is only in the covariance.
+:attr:`LeverArmSolution.by_response` is the change of the lever arm for a response that
+:mod:`~hand_eye_calib.extras.partial.position_columns` estimates.
 """
 
 from __future__ import annotations
@@ -61,20 +62,20 @@ from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
 from hand_eye_calib.extras.partial.position_windows import fit_windows
 
-# Index of a parameter that poses do not have: response of the positions less the odometry to
-# acceleration (s^2). It is not solved with the other parameters.
+# Index of a parameter that poses do not have: the response to acceleration (s^2) of the positions
+# minus that of the odometry. It is not estimated with the other parameters.
 RESPONSE = increments.N_SYSTEMATIC
 
 # Log variance (rad^2) of orientations without bounds.
 _ANY_ROTATION = math.log(100.0)
 
-# Parameters that are solved with the lever arm.
+# Parameters that are estimated together with the lever arm.
 _SHARED = [increments.SCALE, *increments.BIAS, increments.TIME]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LeverArmSolution(ModelSolution):
-    """A lever arm with its noise model.
+    """Lever arm with its noise model.
 
     Attributes
     ----------
@@ -83,9 +84,10 @@ class LeverArmSolution(ModelSolution):
     covariance : (3, 3) array
         Covariance under the model, with the misfit.
     by_response : (3,) array
-        Change of the lever arm (m) for a response of positions to acceleration of 1 s^2.
+        Change of the lever arm (m) if positions respond to acceleration by 1 s^2.
     imprecise : (N,) bool array
-        Positions that are left out, because their neighbourhood is far less precise than the best.
+        Positions that are not used: their neighbourhood is far less precise than the best part of
+        the recording.
     """
 
     lever_arm: FloatArray
@@ -94,7 +96,7 @@ class LeverArmSolution(ModelSolution):
     imprecise: BoolArray
 
     def describe(self, stamps_ns: IntArray) -> Noise:
-        """Return the noise in numbers and in words."""
+        """Return the noise as numbers and as sentences."""
         sigmas = fast_sigmas(self.levels)
         white = length(sigmas.translation_m)
         drift = f"{length(sigmas.walk_translation_m)} and {angle(sigmas.walk_rotation_rad)}"
@@ -137,7 +139,7 @@ def solve(
     Ts_pw_p : (N, 4, 4) array
         Poses of the other sensor in its world.
     positions : (N, 3) array
-        At the same stamps, in a world of their own.
+        Positions at the same stamps, in their own world.
     with_scale : bool
         Whether to estimate the scale between both worlds.
     tuning : Tuning
@@ -176,8 +178,8 @@ class _State:
     ----------
     positions : (N, 3) array
     streams : Streams
-        The child's poses are the positions with the current orientations. Positions that are left
-        out are bridged.
+        Poses of both sensors. The child's poses are the positions with the current orientations.
+        Unused positions are bridged.
     X : (4, 4) array
         (I, l).
     sigmas : (9,) array
@@ -187,9 +189,9 @@ class _State:
     levels : (m,) array
     outliers : Outliers
     walk_factors : (n,) array
-        Factors of the walk's variance, above 1 at jumps.
+        Factors of the variance of the walk; above 1 at jumps.
     imprecise : (N,) bool array
-        Positions whose neighbourhood is far less precise than the best.
+        Positions whose neighbourhood is far less precise than the best part of the recording.
     tuning : Tuning
     """
 
@@ -258,15 +260,14 @@ class _State:
 
     @property
     def left_out(self) -> BoolArray:
-        """Positions (N,) that are not used: outliers and imprecise ones."""
+        """Positions (N,) that are not used: outliers and imprecise positions."""
         return self.outliers.spikes | self.imprecise
 
     @property
     def course(self) -> increments.Course:
-        """Path of the antenna, at the end of the lever arm, as the odometry predicts it.
+        """Path of the antenna (the end of the lever arm), predicted by the odometry.
 
-        The path is in the axes of the positions' world, and does not contain the noise of the
-        positions.
+        The path is in the axes of the positions' world, and without the noise of the positions.
         """
         streams = self.streams
         course = increments.course_of(
@@ -306,7 +307,8 @@ class _State:
     def space(self, model: NoiseModel | None = None) -> StateSpace:
         """Return the state space of all poses.
 
-        It has no rotation to estimate, orientations without bounds, and the odometry's walk.
+        The state space estimates no rotation. Its orientations have no bounds, and its walk is that
+        of the odometry.
         """
         values = np.r_[
             se3.translation_of(self.X), self.parameters[[*_SHARED, RESPONSE]]
@@ -343,7 +345,7 @@ class _State:
             self,
             streams=self.streams[kept],
             outliers=Outliers(jumps, self.outliers.spikes[kept]),
-            # A kept increment may span several jumps: it gets the factor of the worst jump.
+            # A kept increment may span several jumps. Give it the factor of the worst jump.
             walk_factors=np.where(jumps, self.walk_factors.max(), 1.0),
             imprecise=self.imprecise[kept],
         )
@@ -352,8 +354,8 @@ class _State:
     def fitted(self, kinds: tuple[str, ...] = ()) -> _State:
         """Return the state with fitted noise levels.
 
-        A time-correlated error of the positions, of one of these kinds, is added if it lowers the
-        loss by more than ``least_gain``.
+        A time-correlated error of the positions is added if it lowers the loss by more than
+        ``least_gain``.
         """
         tuning = self.tuning
         prior = _level_prior(self.model, self.levels)
@@ -378,7 +380,7 @@ class _State:
     def with_outliers(self, posterior: Posterior) -> _State:
         """Return the state with detected jumps, outliers and imprecise positions.
 
-        Jumps are large steps of the walk; outliers are single wrong positions.
+        Jumps are large steps of the walk. Outliers are single wrong positions.
         """
         of_walk, of_white = innovation_chi_squares(posterior, self.left_out)
         tuning = self.tuning
@@ -405,7 +407,7 @@ class _State:
         )
 
     def after(self, posterior: Posterior, step: FloatArray) -> _State:
-        """Return the state after a step, with the orientations that fit the positions best."""
+        """Return the state after a step, with new orientations that fit the positions best."""
         turns = posterior.states_after(np.r_[step, 0.0])[:, 3:6]
         Ts_cw_c = self.streams.Ts_cw_c.copy()
         Ts_cw_c[:, :3, :3] = se3.rotation_of(Ts_cw_c) @ se3.rotation_exp(turns)
@@ -420,7 +422,7 @@ class _State:
 def _imprecise(
     squares: FloatArray, tuning: Tuning, drift_m2: float
 ) -> BoolArray:
-    """Detect positions (N,) whose neighbourhood is far less precise than the best quarter.
+    """Detect positions (N,) in a neighbourhood that is far less precise than the best quarter.
 
     Parameters
     ----------
@@ -428,8 +430,8 @@ def _imprecise(
         Squared errors, m^2.
     tuning : Tuning
     drift_m2 : float
-        Variance of the odometry's drift from one position to the next: a lower bound of the usual
-        square.
+        Variance of the odometry's drift between successive positions. It is a lower bound of the
+        usual square.
     """
     window = np.ones(min(tuning.neighbours, len(squares)))
     sums = np.convolve(squares, window, mode="same")
@@ -452,13 +454,13 @@ def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
 def _solution(
     state: _State, posterior: Posterior, converged: bool, first_scale: float
 ) -> LeverArmSolution:
-    """Return the solution of the last round, scaled by the scale of the start."""
+    """Return the solution of the last round, in the scale of the start."""
     normal = NormalEquations(_solved(posterior.products))
     n_evidence = len(state.walk_factors) - int(state.left_out.sum())
     misfit = float(normal.cost) / max(3 * n_evidence - 3 - len(_SHARED), 1)
-    # The lever arm is solved without the response to acceleration. Its covariance allows for a
-    # response: it is that of the solve with the response, plus the square of the shift of the lever
-    # arm that the response causes.
+    # The lever arm is estimated without the response to acceleration, but its covariance allows for
+    # a response. It is the covariance of the estimate with the response, plus the square of the
+    # shift of the lever arm by this response.
     with_response = posterior.normal
     covariance = max(misfit, 1.0) * with_response.covariance
     shift = (with_response.step[:-1] - normal.step)[:3]
@@ -468,8 +470,8 @@ def _solution(
     parameters[[*_SHARED, RESPONSE]] += np.r_[
         normal.step[3:], with_response.step[-1]
     ]
-    # An error that is correlated over part of the recording may also have a part that is constant
-    # over all of it. X absorbs this part, so the variance of the error is added.
+    # An error that is correlated over a part of the recording may also have a part that is constant
+    # over the whole recording. X absorbs the constant part, so the variance of the error is added.
     lasting = (
         float(np.exp(state.levels[N_FAST])) if state.model.processes else 0.0
     )
@@ -504,7 +506,7 @@ def _solved(products: FloatArray) -> FloatArray:
 
 
 def _by_response(products: FloatArray) -> FloatArray:
-    """Return the change (3,) of the lever arm for a unit response, from products (10, 10)."""
+    """Return the change (3,) of the lever arm for a response of 1 s^2, from products (10, 10)."""
     response = 3 + len(_SHARED)
     information = products[:response, :response]
     with_response = products[:response, response]
@@ -516,11 +518,11 @@ def _by_response(products: FloatArray) -> FloatArray:
 def _accelerations(
     streams: increments.Streams, X: FloatArray, tuning: Tuning
 ) -> FloatArray:
-    """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in the body's axes.
+    """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in body axes.
 
-    An acceleration is the difference of two velocities, before and after a pose, and does not
-    contain the noise of the pose itself. Accelerations next to gaps and at the ends are zero. The
-    last three columns are zero, too.
+    An acceleration is the difference of two velocities, before and after a pose. It does not
+    contain the noise of this pose. Accelerations near gaps and at the ends are zero, and so are the
+    last three columns.
     """
     path = se3.translation_of(streams.Ts_pw_p @ X)
     stamps_s = streams.stamps_s
@@ -533,7 +535,8 @@ def _accelerations(
     durations_s = stamps_s[k:] - stamps_s[:-k]
     velocities = steps / durations_s[:, None]
     spans_s = (stamps_s[4 * k :] - stamps_s[: -4 * k])[:, None]
-    # Both velocities are means over a quarter of the span, three quarters of the span apart.
+    # Both velocities are means over a quarter of the span. Their centres are three quarters of the
+    # span apart.
     in_world = (velocities[3 * k :] - velocities[: -3 * k]) / (0.75 * spans_s)
     middle = slice(2 * k, -2 * k)
     to_body = np.swapaxes(streams.Ts_pw_p[middle, :3, :3], 1, 2)

@@ -10,8 +10,8 @@ class RateBias:
     Attributes
     ----------
     of : str
-        Sensor that has the bias, whose axes are used: "parent", "child", or a sentence about the
-        difference of two gyroscopes.
+        Sensor that has the bias, in whose axes the bias is: "parent", "child", or a sentence about
+        the difference of two gyroscopes.
     rad_per_s, sigma : tuple of float
         Bias about x, y, z and its standard deviations, rad/s.
     """
