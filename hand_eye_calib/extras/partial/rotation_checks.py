@@ -45,82 +45,85 @@ from hand_eye_calib.extras.partial.rotation_columns import (
 )
 from hand_eye_calib.extras.partial.suspects import Suspect, most_significant
 
-# Median residual (rad) below which rotations were computed from those of the other stream. It
+# Rotations with a smaller median residual (rad) were computed from those of the other stream. It
 # corresponds to quaternions with five digits.
 _COPIED_RAD = 2e-5
 
-# Residual (rad) of a window below which rates were computed from the orientations. Copies have
-# 7e-5, the most accurate odometries and gyroscopes of the study of faults 5e-4.
+# Rates were computed from the orientations if the residual of a window (rad) is below this. Copies
+# have 7e-5; the most accurate odometries and gyroscopes in the study of faults have 5e-4.
 _COPIED_RATES_RAD = 1e-4
 
-# Largest number of motions that are compared, for speed.
+# Largest number of compared motions. It limits the time.
 _MOST_MOTIONS = 3000
 
-# Rates have left-handed axes if the residual of the best reflection is below this share of the
-# residual of the best rotation. Noise alone makes both about equal.
+# Rates have left-handed axes if the residual after the best reflection is below this share of the
+# residual after the best rotation. For noise alone, both are about equal.
 _MIRRORED = 0.5
-# Least residual of the best rotation of such rates, as a share of the rotation vectors. If all
-# motion is about one axis, a reflection only changes the sign of the noise about the others.
+# For left-handed axes, the residual of the best rotation must exceed this share of the rotation
+# vectors. If all motion is about one axis, a reflection only changes the sign of the noise about
+# the other axes.
 _UNMIRRORED = 0.06
-# Duration (s) of these rotation vectors: those of a second are too long to be mirrored by a matrix.
+# Duration (s) of these rotation vectors. Over a second, a matrix could not mirror them, because
+# they are too long.
 _MIRRORED_S = 0.5
 
 # Orientations are inverted only if the inversion leaves at most this share of the rotation
 # unexplained.
 _MAX_UNEXPLAINED = 0.1
-# Smallest ratio of the unexplained shares without and with the inversion.
+# Smallest ratio of the unexplained shares: without the inversion, divided by with the inversion.
 _DECISIVE = 3.0
 
-# Largest relative deviation of a ratio of rates from 57.3, if one unit is degrees and the other
-# radians.
+# Largest relative deviation from 57.3 of a ratio of rates whose units are degrees and radians.
 _UNIT_WITHIN = 0.2
-#: Quantile of rates or rotation angles that is compared: a sensor may rest for long.
+#: Quantile of the rates or rotation angles that is compared. It is high, because a sensor may rest
+#: for a long time.
 TURNING = 0.75
 
-# Smoothing is clear from this number of standard deviations. A jackknife of at most 16 blocks
-# estimates the standard deviation, so the ratio has heavy tails.
+# Smoothing is clear above this number of standard deviations. A jackknife of at most 16 blocks
+# estimates them, so the ratio has heavy tails.
 _CLEAR_SIGMAS = 4.0
-# Smallest smoothing (s^2): that of a filter of 63 ms. EuRoC, KITTI and machines simulated with
-# seeds 77 and 78 have up to 0.0012 without a filter.
+# Smallest smoothing (s^2) that is reported: the effect of a filter of 63 ms. Without a filter,
+# EuRoC, KITTI and machines simulated with seeds 77 and 78 have up to 0.0012.
 _SMOOTHING_S2 = 0.004
 
-# Rates are coarse if the number of different values is below this share of the number of rates.
+# Rates are coarse if the number of different values, divided by the number of rates, is below this.
 _FEW_LEVELS = 0.1
-# Fewest different values of the rates of a sensor that turns.
+# A sensor that turns has at least this number of different rates.
 _LEAST_LEVELS = 5
 # Rounding of integrated rates (rad/s).
 _ROUNDING_RAD_S = 1e-9
-# Smallest step of coarse rates (rad/s). Those of a gyroscope with 16 bits are 0.001.
+# Smallest step of coarse rates (rad/s). A gyroscope with 16 bits has steps of 0.001.
 _STEP_RAD_S = 0.005
 
-# Rounding of angles that are computed from rotation matrices, and smallest step of coarse
-# orientations (deg).
+# Rounding (deg) of angles that are computed from rotation matrices.
 _ROUNDING_DEG = 1e-6
+# Smallest step (deg) of coarse orientations.
 _STEP_DEG = 0.2
 
-# Fewest clipped rates, which are equal to the largest rate.
+# Fewest clipped rates. A clipped rate equals the largest rate.
 _LEAST_CLIPPED = 20
-# Clipped rates outnumber those that are smaller than the largest rate by at most this share.
+# Rates are not clipped if more rates than the clipped ones are below the largest rate by at most
+# this share.
 _NEAR_LIMIT = 0.02
 
-# Largest usual standard deviation (rad/s) of a bias between parts of a recording. Rates against
+# Largest usual standard deviation (rad/s) of the bias between parts of a recording. Rates against
 # monocular odometries of EuRoC have up to 0.14 deg/s.
 _BIAS_DRIFT_RAD_S = float(np.radians(0.15))
 
 
 class _Streams(NamedTuple):
-    """Streams of rotations, each on its own clock, and their pairs on one clock.
+    """Streams of rotations, each on its own clock, and their pairs on a common clock.
 
     Attributes
     ----------
     parent, child : Trajectory
     pairs : PosePairs
     name : {"parent", "child"}
-        The stream to which faults are attributed: that with rates.
+        The stream to which faults are attributed: the stream with rates, if there is one.
     has_rates : bool
         Whether this stream has rates.
     are_exact : bool
-        Whether the user called both streams exact. Exact streams may agree to rounding.
+        Whether the user declared both streams as exact. Exact streams may agree up to rounding.
     """
 
     parent: Trajectory
@@ -137,9 +140,9 @@ class _Streams(NamedTuple):
 
 
 def measured_stream(parent_measures: str, child_measures: str) -> str:
-    """Return the stream to which faults are attributed: the one that measures least.
+    """Return the stream to which faults are attributed: the one with fewer measured quantities.
 
-    A stream of the node whose option is ``auto`` has poses.
+    In the node, a stream whose option is ``auto`` has poses.
     """
     order = ("rates", "rotations", "poses", "auto")
     is_parent = order.index(parent_measures) < order.index(child_measures)
@@ -153,12 +156,12 @@ def check_solved(
     config: CalibratorConfig,
     is_unrelated: bool = False,
 ) -> list[Finding]:
-    """Check rotations or rates against their result; return the findings of the first failed check.
+    """Check rotations or rates against their result. Return the findings of the first failed check.
 
     Parameters
     ----------
     parent, child : Trajectory
-        Each on its own clock.
+        Streams, each on its own clock.
     calibration : Calibration
         The result from both streams.
     config : CalibratorConfig
@@ -197,7 +200,7 @@ def check_solved(
 
 
 def _check_reading(streams: _Streams) -> list[Finding]:
-    """Detect streams in another convention or unit than assumed, or with yaw only."""
+    """Detect streams with another convention or unit than assumed, or with yaw only."""
     flat = check_flat(streams.parent.scaled(0.0), streams.child.scaled(0.0))
     return flat or _check_unit(streams) or _check_conventions(streams)
 
@@ -224,21 +227,21 @@ def check_rotation(
     priors: Collection[str],
     has_rates: bool,
 ) -> list[Finding]:
-    """Detect a rotation of zero, which suggests that both streams come from one sensor.
+    """Detect a rotation of zero, a sign that both streams come from one sensor.
 
     Parameters
     ----------
     rotation : (3, 3) array
     sigmas : (3,) array
-        Standard deviations (rad), infinite for unobservable axes.
+        Standard deviations (rad). Unobservable axes have infinite values.
     priors : collection of str
-        Axes with a prior. With a prior about a rotation, nothing is checked.
+        Axes with a prior. With a prior about any rotation, there is no check.
     has_rates : bool
-        Whether a stream has rates. The finding is an error then, otherwise a warning: the axes of
-        two cameras may well be parallel.
+        Whether a stream has rates. The finding is then an error. Otherwise it is a warning, because
+        the axes of two cameras may well be parallel.
     """
     limit_rad = agreement.MAX_SIGMA_RAD
-    # The standard deviations must be small on all axes: if two level sensors turn only about the
+    # The standard deviations must be small on all axes. If two level sensors turn only about the
     # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
     if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
         return []
@@ -262,7 +265,7 @@ def check_rotation(
 
 
 def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
-    """Detect rotations that were computed from the other stream: only rounding differs."""
+    """Detect rotations that were computed from the other stream: the difference is rounding."""
     of_parent, of_child = _rotation_vectors(pairs)
     if len(of_parent) < MIN_PAIRS:
         return []
@@ -281,12 +284,12 @@ def _copied_rotations(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
 def _rotation_vectors(
     pairs: PosePairs, lag_s: float = agreement.SHORT_S
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors (K, 3) of parent and child over a time, each in its own sensor frame."""
+    """Return rotation vectors (K, 3) of both sensors over a time, each in its own frame."""
     return _usable_vectors(pairs_over(pairs, lag_s, _MOST_MOTIONS))
 
 
 def _usable_vectors(motions: MotionPairs) -> tuple[FloatArray, FloatArray]:
-    """Rotation vectors (K, 3) of the motions of parent and child that have a clear axis."""
+    """Return rotation vectors (K, 3) of the motions of parent and child with a clear axis."""
     of_parent = se3.rotation_log(se3.rotation_of(motions.Ts_parenti_parentj))
     of_child = se3.rotation_log(se3.rotation_of(motions.Ts_childi_childj))
     angles = np.maximum(
@@ -317,14 +320,14 @@ def _check_unit(streams: _Streams) -> list[Finding]:
 
 
 def _rates(stream: Trajectory) -> FloatArray:
-    """Return the rates (N - 1, 3) between the rotations of a stream, rad/s."""
+    """Return the angular rates (N - 1, 3) between successive rotations of a stream, rad/s."""
     rotations = se3.rotation_of(stream.poses)
     turns = se3.rotations_between(rotations[:-1], rotations[1:])
     return turns / (np.diff(stream.stamps_ns) * 1e-9)[:, None]
 
 
 def _large_rate(stream: Trajectory) -> float:
-    """Return a large angular rate of a stream, rad/s, above zero."""
+    """Return a large quantile of the angular rates of a stream, rad/s. It is above zero."""
     rates = np.linalg.norm(_rates(stream), axis=1)
     return max(float(np.quantile(rates, TURNING)), 1e-12)
 
@@ -332,8 +335,8 @@ def _large_rate(stream: Trajectory) -> float:
 def _check_conventions(streams: _Streams) -> list[Finding]:
     """Detect orientations of one stream that are inverted, or quaternions in another order.
 
-    Rotations do not reveal which: reading w x y z as x y z w inverts the rotations and turns both
-    frames. Without rates, they do not reveal the stream either.
+    Rotations do not reveal which of both mistakes: w x y z that are read as x y z w invert the
+    rotations and turn both frames. Without rates, they do not reveal the stream, either.
     """
     pairs = streams.pairs
     inverted = replace(
@@ -353,7 +356,7 @@ def _check_conventions(streams: _Streams) -> list[Finding]:
 
 
 def _unexplained(pairs: PosePairs) -> float:
-    """Return the share of the rotations that no extrinsic rotation explains."""
+    """Return the share of the rotations that the best extrinsic rotation leaves unexplained."""
     motions = pairs_over(pairs, agreement.SHORT_S, _MOST_MOTIONS)
     of_parent, of_child = _usable_vectors(motions)
     residuals = of_child @ align_rotation_vectors(motions).T - of_parent
@@ -366,7 +369,8 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
     of_parent, of_child = _rotation_vectors(streams.pairs, _MIRRORED_S)
     if len(of_parent) < BLOCKS * MIN_PAIRS:
         return []
-    # Subtract the mean, which contains the bias: a wrong rotation spoils the estimate of the bias.
+    # The mean contains the bias. Subtract it, because a wrong rotation makes the estimate of the
+    # bias wrong.
     of_parent = of_parent - of_parent.mean(axis=0)
     of_child = of_child - of_child.mean(axis=0)
     left, _, right = np.linalg.svd(of_child.T @ of_parent)
@@ -386,14 +390,14 @@ def _check_handedness(streams: _Streams) -> list[Finding]:
 
 
 def _check_levels(streams: _Streams) -> list[Finding]:
-    """Detect coarse orientations, and rates in coarse steps or clipped at a gyroscope's limit."""
+    """Detect coarse orientations, and rates that have coarse steps or are clipped at a limit."""
     if not streams.has_rates:
         return _check_coarse_orientations(streams)
     rates = _rates(streams.measured)
     for axis, column in zip("xyz", rates.T, strict=True):
         steps = _coarse_steps(column, _ROUNDING_RAD_S)
         if steps is not None:
-            # The mean of two rates has half the steps.
+            # A mean of two rates has half of the step.
             step_rad_s = 2.0 * median(steps)
             if step_rad_s > _STEP_RAD_S:
                 return [
@@ -419,9 +423,8 @@ def _check_levels(streams: _Streams) -> list[Finding]:
 def _coarse_steps(values: FloatArray, rounding: float) -> FloatArray | None:
     """Return the differences between neighbouring levels of values (N,), or None.
 
-    The result is None if the values have as many levels as those of a sensor with fine resolution,
-    or so few levels that the sensor does not turn. Values that differ by less than ``rounding`` are
-    one level.
+    The result is None if the values have as many levels as a sensor with fine resolution, or so few
+    that the sensor does not turn. Values that differ by less than ``rounding`` count as one level.
     """
     levels = np.unique(np.round(values / rounding)) * rounding
     if _LEAST_LEVELS <= len(levels) < _FEW_LEVELS * len(values):
@@ -430,7 +433,7 @@ def _coarse_steps(values: FloatArray, rounding: float) -> FloatArray | None:
 
 
 def _check_coarse_orientations(streams: _Streams) -> list[Finding]:
-    """Detect orientations whose roll, pitch or yaw is in coarse steps."""
+    """Detect orientations whose roll, pitch or yaw changes in coarse steps."""
     for name, stream in (("parent", streams.parent), ("child", streams.child)):
         angles_deg = np.degrees(
             se3.rotation_to_rpy(se3.rotation_of(stream.poses))
@@ -468,7 +471,7 @@ def _check_mount(pairs: PosePairs, rotation: FloatArray) -> list[Finding]:
 
 
 def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
-    """Detect the fault that is most significant in the regression on all faults."""
+    """Detect the most significant fault in the regression on all faults."""
     fitted = fit_pairs(streams.pairs, rotation, streams.name, streams.has_rates)
     if not fitted:
         return [finding("unchecked_rotations", streams.name)]
@@ -480,7 +483,8 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
         evidence = "The rates agree with the orientations of the other sensor"
         return copied(evidence, residual_rad=fitted.remaining)
     suspects = [_smoothing(fitted, streams), _gain(fitted, streams)]
-    # A gyroscope errs about its own axes. An attitude sensor errs about the vertical, too.
+    # The errors of a gyroscope are about its own axes. An attitude sensor also has errors about the
+    # vertical.
     of_kind = _shear if streams.has_rates else _main_gain
     suspects.append(of_kind(fitted, streams))
     findings = most_significant(suspects)
@@ -500,7 +504,7 @@ def _check_response(streams: _Streams, rotation: FloatArray) -> list[Finding]:
 
 
 def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
-    """Test whether one stream is smoothed more than the other."""
+    """Return the test whether one stream is smoothed more than the other."""
     values, sigmas = fitted.estimate("smoothing")
     smoothing_s2 = float(values[0])
     n_sigmas = abs(smoothing_s2) / max(float(sigmas[0]), 1e-12)
@@ -519,7 +523,7 @@ def _smoothing(fitted: RotationFit, streams: _Streams) -> Suspect:
 
 
 class _Largest(NamedTuple):
-    """The most significant of three values of a fault."""
+    """The most significant of the three values of a fault."""
 
     place: int
     value: float
@@ -527,9 +531,9 @@ class _Largest(NamedTuple):
 
 
 def _largest(fitted: RotationFit, name: str) -> _Largest | None:
-    """Return the most significant value of a fault that noise of the columns does not explain.
+    """Return the most significant value of a fault that noise in the columns does not explain.
 
-    The columns are integrals of rates, and contain the noise of the orientations.
+    The columns are integrals of rates, so they contain the noise of the orientations.
     """
     values, sigmas = fitted.estimate(name)
     is_real = np.abs(values) > agreement.BIASES * fitted.biases(name)
@@ -541,7 +545,7 @@ def _largest(fitted: RotationFit, name: str) -> _Largest | None:
 
 
 def _gain(fitted: RotationFit, streams: _Streams) -> Suspect:
-    """Test whether the rates about an axis of the sensor are too large or too small."""
+    """Return the test whether the rates about an axis of the sensor are too large or too small."""
     largest = _largest(fitted, "gains")
     if not largest:
         return Suspect(0.0, None)
@@ -554,7 +558,7 @@ def _gain(fitted: RotationFit, streams: _Streams) -> Suspect:
 
 
 def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
-    """Test whether the rotations about the main axis are too large or too small."""
+    """Return the test whether rotations about the main axis are too large or too small."""
     gain, sigma, bias = fitted.main_gain()
     if abs(gain) <= agreement.BIASES * bias:
         return Suspect(0.0, None)
@@ -566,7 +570,7 @@ def _main_gain(fitted: RotationFit, streams: _Streams) -> Suspect:
 
 
 def _shear(fitted: RotationFit, streams: _Streams) -> Suspect:
-    """Test whether two axes of a gyroscope are not perpendicular."""
+    """Return the test whether two axes of a gyroscope are not perpendicular."""
     largest = _largest(fitted, "shears")
     if not largest:
         return Suspect(0.0, None)

@@ -1,7 +1,8 @@
-"""Regression of the rotations of one sensor on possible faults, with another as the reference.
+"""Regression of one sensor's rotations on possible faults, with another sensor as reference.
 
-The reference has the orientations G_i, rotated by the extrinsic to the axes of the measured sensor.
-The measured sensor has the orientations Q_i. In a window, their errors in the world are
+The reference has the orientations G_i, rotated by the extrinsic into the axes of the measured
+sensor. The measured sensor has the orientations Q_i. The errors of a window, in the world of the
+reference, are
 
     e_i = Log(W^T Q_i G_i^T) = G_i phi + int G S w dt - G_i w_i d + c b_i + nuisances + noise
 
@@ -15,15 +16,15 @@ with
   method for IMU calibration without external equipments*, 2014),
 - the delay d (s) and the smoothing c (s^2), which any low-pass filter has at low frequencies.
 
-The smoothing multiplies, with the angular acceleration a = dw/dt,
+The smoothing c is multiplied by b_i. With the angular acceleration a = dw/dt,
 
     b_i = G_i a_i                            if the sensor measures orientations,
     b_i = G_i a_i - int G (w x a) dt         if the sensor measures rates.
 
-The nuisances of a window are the error of W and a constant bias of rates. If the sensor measures
-orientations, a constant drift of the world replaces the bias. So neither bias nor drift looks like
-a fault. The rates of each stream are instrumental variables for the rates of the other stream,
-because their noise is independent.
+The nuisances of a window are the error of W and a constant bias of rates, or a constant drift of
+the world if the sensor measures orientations. So neither bias nor drift looks like a fault. The
+rates of each stream are instrumental variables for the rates of the other stream, because their
+noise is independent.
 """
 
 from dataclasses import dataclass
@@ -48,22 +49,21 @@ from hand_eye_calib.extras.partial.columns import (
     split,
 )
 
-# Duration of a window (s): long enough for turns, short enough for a constant bias.
+# Duration (s) of a window. It is long enough for turns, and short enough for a constant bias.
 _WINDOW_S = 20.0
 
-# Step (s) of the finite differences for rates. If the interval between stamps is longer, the
-# interval is the step.
+# Step (s) of the finite differences for rates. A longer interval between stamps replaces it.
 _STEP_S = 0.1
 
-# Number of equal sections of a recording whose biases are compared.
+# Number of equal parts of a recording whose biases are compared.
 _PARTS = 4
 
-# Planes of two axes that may be misaligned, in the order of the third axis.
+# Planes of two axes that may be misaligned. They are in the order of the third axis.
 PLANES = ((1, 2), (0, 2), (0, 1))
 
 
 class _Motion(NamedTuple):
-    """Motion of a stream in W windows of K samples, as columns of the regression.
+    """Motion of a stream in W windows of K samples, as columns for the regression.
 
     Vectors are in the axes of the world of the reference stream.
 
@@ -72,9 +72,10 @@ class _Motion(NamedTuple):
     rates : (W, K, 3) array
         Angular rates.
     bends : (W, K, 3) array
-        Rotation vectors that smoothing of 1 s^2 adds.
+        Rotation vectors that a smoothing of 1 s^2 adds.
     gains, shears : (W, K, 3, 3) array
-        Integrals of the rate about each axis, and of the rates of each plane, exchanged.
+        Integrals of the rates: gains about each axis, shears with the two rates of a plane
+        exchanged.
     """
 
     rates: FloatArray
@@ -84,7 +85,7 @@ class _Motion(NamedTuple):
 
 
 class _Windows(NamedTuple):
-    """Windows of both streams. ``orientations`` (W, K, 3, 3) are those of the reference."""
+    """Windows of both streams. The reference has the ``orientations`` (W, K, 3, 3)."""
 
     orientations: FloatArray
     reference: _Motion
@@ -129,7 +130,7 @@ class RotationFit(Fit):
     Attributes
     ----------
     main_axis : (3,) array
-        Unit vector of the axis of most rotation, in the axes of the measured sensor.
+        Unit vector of the axis with most rotation, in the axes of the measured sensor.
     """
 
     main_axis: FloatArray
@@ -138,8 +139,8 @@ class RotationFit(Fit):
     def axes_covariance(self) -> FloatArray:
         """Covariance (3, 3), rad^2, that possible faults add to the extrinsic rotation.
 
-        If two axes of a sensor are not perpendicular, the frame of this sensor is uncertain by the
-        same angle. The covariance is at most that of faults of usual size.
+        If two axes of a sensor are not perpendicular, its frame is uncertain by the same angle. The
+        covariance is at most that of faults of usual size.
         """
         shears, sigmas = self.estimate("shears")
         estimated = self.open_covariance + np.diag(
@@ -151,9 +152,9 @@ class RotationFit(Fit):
     def _usual_covariance(self) -> FloatArray:
         """Covariance (3, 3) of the rotation, rad^2, for faults of usual size.
 
-        About an axis without turns, the rates are only noise: a weak instrumental variable.
-        Estimates of gains and shears are then arbitrary. Therefore the prior standard deviations of
-        gains and shears replace estimates that are not significant.
+        About an axis without turns, the rates are noise and a weak instrument, so gains and shears
+        can have any estimate. Therefore estimates that are not significant are replaced by prior
+        standard deviations.
         """
         weak: list[int] = []
         prior_sigmas: list[float] = []
@@ -175,8 +176,8 @@ class RotationFit(Fit):
     def main_gain(self) -> tuple[float, float, float]:
         """Estimate the gain about the main axis u, minus 1: u' S u.
 
-        If a machine turns about one axis only, this gain is certain. The gains about the axes of
-        the sensor are not.
+        If a machine turns about one axis only, this gain is certain, while the gains about the
+        sensor's axes are uncertain.
 
         Returns
         -------
@@ -198,7 +199,8 @@ class RotationFit(Fit):
     def bias_drift(self) -> float:
         """Largest standard deviation (rad/s) of the bias of rates between parts of the recording.
 
-        The bias of a part is the mean of its windows, because noise differs from window to window.
+        The bias of a part is the mean over its windows, because noise differs from window to
+        window.
         """
         biases = self.nuisances[:, 3:]
         of_parts = [
@@ -215,9 +217,9 @@ def fit_pairs(
     Parameters
     ----------
     pairs : PosePairs
-        On one clock. The positions are ignored.
+        Pose pairs on one clock. The positions are ignored.
     rotation : (3, 3) array
-        Best estimate of the extrinsic rotation. The values of the regression are relative to it.
+        Best estimate of the extrinsic rotation. The regression estimates a correction of it.
     stream : {"parent", "child"}
         The measured stream, to which faults are attributed.
     has_rates : bool
@@ -246,9 +248,9 @@ def fit_rotations(
     ----------
     stamps_ns : (N,) int64 array
     reference : (N, 3, 3) array
-        Orientations of the reference, rotated to the axes of the measured sensor.
+        Orientations of the reference, rotated into the axes of the measured sensor.
     measured : (N, 3, 3) array
-        Orientations, or integrated rates, of the measured sensor.
+        Orientations or integrated rates of the measured sensor.
     has_rates : bool
         Whether the measured sensor has rates.
 
@@ -265,7 +267,7 @@ def fit_rotations(
     if in_windows is None:
         return None
     is_used = in_windows.is_used
-    # Errors in the world of the reference, about the mean of each window.
+    # Errors in the world of the reference, relative to the mean of each window.
     between = in_windows(measured) @ np.swapaxes(in_windows(reference), 2, 3)
     worlds = se3.nearest_rotation(
         (between * is_used[..., None, None]).sum(axis=1)
@@ -284,7 +286,7 @@ def fit_rotations(
     nuisances = np.concatenate([moving, in_windows(drifting)], axis=3)
     fitted = fit_columns(_COLUMNS, windows, is_used, errors, nuisances)
     turns = se3.rotations_between(reference[:-1], reference[1:])
-    # The eigenvalues are ascending.
+    # The last axis has the largest eigenvalue.
     _, axes = np.linalg.eigh(turns.T @ turns)
     return RotationFit(**vars(fitted), main_axis=axes[:, -1])
 

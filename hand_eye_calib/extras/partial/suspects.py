@@ -1,4 +1,4 @@
-"""Possible faults that a regression estimates, of which the most significant is reported."""
+"""Possible faults that a regression estimates. The most significant fault is reported."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ class Suspect(NamedTuple):
     sigmas : float
         Size of the fault in standard deviations.
     issue : Finding or None
-        The finding if the fault is significant.
+        Finding; None if the fault is not significant.
     """
 
     sigmas: float
@@ -22,6 +22,6 @@ class Suspect(NamedTuple):
 
 
 def most_significant(suspects: Sequence[Suspect]) -> list[Finding]:
-    """Return the finding of the most significant fault, as a list that may be empty."""
+    """Return a list with the finding of the most significant fault; empty if there is none."""
     ranked = sorted(suspects, key=lambda suspect: suspect.sigmas, reverse=True)
     return [suspect.issue for suspect in ranked if suspect.issue][:1]

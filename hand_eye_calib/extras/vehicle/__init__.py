@@ -31,7 +31,7 @@ _LIVE_TYPES = (
 def register() -> None:
     """Register vehicles as a kind of data, their parameters, and readers of wheel data.
 
-    The registered functions import their modules only when they are called.
+    A registered function imports its module only when it is called.
     """
     needs = "wheels need the poses of a sensor"
     for word in (

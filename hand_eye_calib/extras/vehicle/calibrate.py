@@ -19,16 +19,17 @@ def calibrate_vehicle(
 ) -> Calibration:
     """Estimate the pose of a sensor in the frame of its vehicle, and the size of the wheels.
 
-    The frame of the vehicle is in the middle of the driven or rear axle: x ahead, y left, z up. A
-    drive on a flat floor does not determine z. Without wheel data, it does not determine y, either.
+    The origin of the vehicle frame is in the middle of the driven or rear axle: x ahead, y left, z
+    up. A drive on a flat floor does not determine z. A drive without wheel data does not determine
+    y, either.
 
     Parameters
     ----------
     sensor : Trajectory, path, array or DataFrame
         Poses of the sensor in its own world, m.
     wheels : Trajectory or path, optional
-        A csv file of wheel data, or the result of :func:`hand_eye_calib.wheel_trajectory`. For the
-        poses of wheel odometry, set ``parent_measures`` to ``wheel_odometry`` or ``omni``.
+        Csv file of wheel data, or the result of :func:`hand_eye_calib.wheel_trajectory`. For poses
+        of a wheel odometry, set ``parent_measures`` to ``wheel_odometry`` or ``omni``.
     **options
         Options of :func:`hand_eye_calib.calibrate`; the parent is the vehicle, the child the
         sensor.
@@ -58,8 +59,8 @@ def calibrate_vehicle(
 def _driving(sensor: Trajectory) -> Trajectory:
     """Return the parent stream for a sensor without wheel data.
 
-    Its kind of data, "driving", means that only the limits of a vehicle's motion are used, not the
-    poses of the stream.
+    Its kind of data is "driving": the poses of the stream are not used, only the limits of a
+    vehicle's motion.
     """
     return replace(
         sensor, sensor_frame="base_link", world_frame="", measures="driving"

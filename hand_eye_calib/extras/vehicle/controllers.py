@@ -1,7 +1,7 @@
 """Write the parameters of wheels for the controllers of ros2_controllers.
 
-The names, and the equations in which the controllers use them, are those of ros2_controllers 4.42.1
-(Jazzy) and of its master branch of August 2026 (94e74de3):
+Names and equations of the parameters are those of ros2_controllers 4.42.1 (Jazzy) and of its master
+branch of August 2026 (94e74de3):
 
 - diff_drive_controller: forward = (R_l l + R_r r) / 2, turn = (R_r r - R_l l) / B, for rates l and
   r of the wheels, with R_l = left_wheel_radius_multiplier * wheel_radius, R_r likewise, and
@@ -24,12 +24,12 @@ from hand_eye_calib.core.base.text import fixed
 from hand_eye_calib.core.base.version import version_of
 from hand_eye_calib.extras.vehicle.parameters import VehicleParameters
 
-# Number of decimals of a parameter.
+# Number of decimals in a parameter.
 _DECIMALS = 6
 
 
 class Controller(NamedTuple):
-    """Parameters of a controller: those with a value, and remarks about others."""
+    """Parameters of a controller: those with a value, and remarks about the others."""
 
     name: str
     values: dict[str, float]
@@ -120,7 +120,7 @@ def _steered(
 
 
 def _of_omni(wheels: VehicleParameters) -> Controller:
-    """Return the parameters for an omnidirectional vehicle, relative to those of its odometry."""
+    """Return the parameters of an omnidirectional vehicle, relative to those of its odometry."""
     forward, left, turn = (parameter.value for parameter in wheels.parameters)
     length = "kinematics.sum_of_robot_center_projection_on_X_Y_axis"
     values = {}

@@ -22,7 +22,7 @@ class JointStateReading(Reading):
     names : str
         Names of the joints, see :class:`~.joints.WheelJoints`.
     measures : str
-        Kind of wheel data; "auto" for the left and the right wheels.
+        Kind of wheel data; "auto" for left and right wheels.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class JointStateReading(Reading):
         self._rows: list[tuple[int, int, tuple[float, float]]] = []
 
     def take(self, run: Run) -> None:
-        """Read the next messages; raise InputError if their wheels are unclear."""
+        """Read the next messages. Raise InputError if the joints of the wheels are unclear."""
         for message, bag_ns in zip(
             run.decoded(), run.bag_ns.tolist(), strict=True
         ):
@@ -48,7 +48,7 @@ class JointStateReading(Reading):
                 )
 
     def table(self) -> PoseTable:
-        """Return the path of the unit vehicle; raise InputError if no message has wheels."""
+        """Return the path of the unit vehicle. Raise InputError if no message has wheels."""
         joints = self._joints.joints
         if joints is None or not self._rows:
             raise InputError(
@@ -79,7 +79,7 @@ class JointStateReading(Reading):
         return self._stamped(table.recorded(self.stream, bag_times_ns[is_used]))
 
     def _usable(self, values: FloatArray, stamps_ns: IntArray) -> BoolArray:
-        """Return which messages (N,) have all values, and stamps after those before them."""
+        """Return a mask (N,) of messages whose values are complete and whose stamps increase."""
         earlier_ns = np.maximum.accumulate(
             np.insert(stamps_ns[:-1], 0, stamps_ns[0] - 1)
         )

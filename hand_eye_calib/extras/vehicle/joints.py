@@ -1,8 +1,8 @@
 """Find the wheels of a vehicle among the joints of a robot.
 
-Joints have names such as ``rear_left_wheel_joint`` and ``front_left_steering_joint``. A user may
-name them instead: the joints of the left and of the right wheels, or of the driven wheels and of
-the steered ones, such as ``rear_left+rear_right,front_steering``.
+Joints have names such as ``rear_left_wheel_joint`` and ``front_left_steering_joint``. The user may
+also name the joints of the left and of the right wheels, or those of the driven wheels and of the
+steering, such as ``rear_left+rear_right,front_steering``.
 """
 
 import math
@@ -20,8 +20,8 @@ from hand_eye_calib.core.base.text import listing
 # Kinds of wheel data with a steering angle.
 STEERED = ("steering", "tricycle")
 
-# Steering angle (rad) above which the mean of the cotangents of both angles of an Ackermann axle is
-# used. Below, the mean of the angles differs from it by less than 0.1 %, and noise has less effect.
+# Above this steering angle (rad), the mean of the cotangents of both angles of an Ackermann axle is
+# used. Below it, the mean of the angles is used: it has less noise, and differs by less than 0.1 %.
 _SMALL_ANGLE = 0.05
 
 _LEFT = "left|_l(_|$)|^l_"
@@ -29,9 +29,9 @@ _RIGHT = "right|_r(_|$)|^r_"
 
 
 class Joints(NamedTuple):
-    """Names of the joints of both columns of wheel data.
+    """Names of the joints in the two columns of wheel data.
 
-    ``first`` are the left wheels, or the driven wheels; ``second`` are the right wheels, or the
+    ``first`` has the left wheels, or the driven wheels. ``second`` has the right wheels, or the
     steered wheels.
     """
 
@@ -49,18 +49,18 @@ class WheelJoints:
     measures : str
         Kind of wheel data: "wheels", "steering" or "tricycle".
     names : str
-        Joints as the user names them; empty to find them by their names.
+        Joints according to the user; empty to find them by their names.
 
     Raises
     ------
     InputError
-        If the user does not name two groups of joints.
+        If the user has not named two groups of joints.
     """
 
     def __init__(self, topic: str, measures: str, names: str = "") -> None:
         self._topic = topic
         self._measures = measures
-        # Angle (rad) of each joint in the last message, with its whole turns.
+        # Angle (rad) of each joint in the last message, including whole turns.
         self._angles: dict[str, float] = {}
         self.are_positions = False
         self.joints: Joints | None = None
@@ -84,7 +84,7 @@ class WheelJoints:
 
     @property
     def expected(self) -> str:
-        """How the user names the joints."""
+        """Names of the joints in the form in which the user writes them."""
         pair = "WHEEL,STEERING" if self._measures in STEERED else "LEFT,RIGHT"
         return f"name the joints: {self._topic}?{pair}"
 
@@ -94,10 +94,10 @@ class WheelJoints:
         positions: Sequence[float],
         velocities: Sequence[float],
     ) -> tuple[float, float] | None:
-        """Return the wheel data in a message; None for a message of other joints.
+        """Return the wheel data in a message; None if the message is about other joints.
 
-        A value is the mean of the rates (rad/s) of its wheels, or of their angles (rad) if the
-        message has no velocities (``are_positions``); or the steering angle (rad). It is NaN if a
+        A value is a steering angle (rad), or the mean over its wheels: of their rates (rad/s), or
+        of their angles (rad) if the message has no velocities (``are_positions``). It is NaN if a
         joint has no value.
 
         Raises
@@ -110,7 +110,7 @@ class WheelJoints:
             *self.joints.first,
             *self.joints.second,
         } <= {*names}:
-            # Other joints may be published on the same topic.
+            # Other joints can use the same topic.
             return None
         self.are_positions = not len(velocities)
         angles = dict(zip(names, positions, strict=False))
@@ -127,8 +127,8 @@ class WheelJoints:
     def _unwrapped(self, angles: Mapping[str, float]) -> dict[str, float]:
         """Return the angles (rad) of the joints, without jumps of whole turns.
 
-        Some drivers count the angle of a wheel within one turn, so a wheel is taken to turn by less
-        than half a turn between two messages.
+        Some drivers count the angle of a wheel within one turn. A wheel is therefore assumed to
+        turn by less than half a turn between two messages.
         """
         for name, angle in angles.items():
             earlier = self._angles.get(name, angle)
@@ -138,7 +138,7 @@ class WheelJoints:
         return self._angles
 
     def _found(self, names: Sequence[str]) -> Joints | None:
-        """Return the joints by their names; None without wheels."""
+        """Return the joints of the wheels by their names; None if there are no wheels."""
         steered = tuple(name for name in names if "steer" in name.lower())
         wheels = [name for name in names if _is_wheel(name)]
         if not wheels:
@@ -167,7 +167,7 @@ class WheelJoints:
     ) -> Joints:
         """Return the driven wheels, and the joints with the steering angle.
 
-        The driven wheels are those of the fixed axle, or the steered wheel of a tricycle.
+        The driven wheels are the wheels of the fixed axle, or the steered wheel of a tricycle.
         """
         if not steered:
             raise self._unclear(names)
@@ -175,14 +175,14 @@ class WheelJoints:
         front = [name for name in wheels if "front" in name.lower()]
         driven = front if self._measures == "tricycle" else rear
         if not driven:
-            # Without such a word, all wheels belong to one axle.
+            # If the names have no word for front or rear, all wheels are on one axle.
             if front or rear:
                 raise self._unclear(names)
             driven = [*wheels]
         return Joints(tuple(driven), steered)
 
     def _unclear(self, names: Sequence[str]) -> InputError:
-        """Return the error for joints whose wheels are unclear."""
+        """Return the error about joints whose wheels are unclear."""
         return InputError(
             f"{self._topic}: the wheels are unclear among the joints {listing(names)}; "
             f"{self.expected}"
@@ -199,7 +199,7 @@ class WheelJoints:
         """
         means = np.asarray((rows[1:] + rows[:-1]) / 2.0)
         if self.are_positions:
-            # The second column is a steering angle, or the angle of a wheel.
+            # The second column is a steering angle, or the angle of a wheel in data of two wheels.
             n_wheels = 1 if self._measures in STEERED else 2
             durations_s = np.diff(stamps_ns)[:, None] * 1e-9
             means[:, :n_wheels] = (
@@ -209,16 +209,16 @@ class WheelJoints:
 
 
 def _is_wheel(name: str) -> bool:
-    """Whether the name of a joint is that of a wheel that drives, and does not steer."""
+    """Return whether the name of a joint is that of a driving wheel without steering."""
     lower = name.lower()
     return "wheel" in lower and not ("steer" in lower or "caster" in lower)
 
 
 def middle_angle(angles: Sequence[float]) -> float:
-    """Return the angle in the middle of a steered axle from the angles of its wheels (rad).
+    """Return the angle in the middle of a steered axle, from the angles of its wheels (rad).
 
-    The wheels of an Ackermann axle point to one centre of rotation. Their cotangents are linear in
-    the place on the axle, so that in the middle the cotangent is the mean.
+    The wheels of an Ackermann axle point to a common centre of rotation. Their cotangents are
+    linear along the axle, so the cotangent in the middle is the mean.
     """
     if min(map(abs, angles)) < _SMALL_ANGLE:
         return fmean(angles)

@@ -1,4 +1,4 @@
-"""The kind of data "vehicle": wheels and a sensor with poses, or such a sensor alone.
+"""Kind of data "vehicle": wheels and a sensor with poses, or such a sensor alone.
 
 A kind supplies the functions that solve and check its data, see :mod:`..core.engine.kinds`.
 """
@@ -50,66 +50,66 @@ from hand_eye_calib.extras.vehicle.solving import (
 )
 from hand_eye_calib.extras.vehicle.wheels import MODELS, RIVALS, steps_of
 
-# Duration of a window (s) with wheel data.
+# Duration (s) of a window if there are wheel data.
 _WINDOW_S = 0.5
-# Duration of a window (s) without wheel data, in which the curvature must be nearly constant.
+# Duration (s) of a window without wheel data. The curvature in it must be nearly constant.
 _WINDOW_ALONE_S = 0.3
 
-# Quantile of the motions, or of their deviations, that is taken as the usual size.
+# Quantile of the motions, or of their deviations, that counts as their usual size.
 _USUAL = 0.9
-# The vehicle rests in a window if it moves by less than this share of the usual motion.
+# A vehicle that moves by less than this share of its usual motion is at rest in a window.
 _AT_REST = 0.05
 
-# Poses are of two dimensions if they move across the plane by less than this (m, rad): rounding.
+# Poses are two-dimensional if they move by less than this (m, rad) across the plane. Smaller motion
+# is rounding.
 _FLAT = 1e-6
-# Poses at the start of a window may be early by this time (s): rounding.
+# By rounding, poses at the start of a window may be early by this time (s).
 _ROUNDING_S = 1e-6
 
-# The drive determines an axis if its information is at least this multiple of that of noise. The
-# multiple is 168 and more in simulated figures of eight, below 2 on straight roads and on one
+# The drive determines an axis if its information exceeds the information in noise by this factor.
+# Measured: at least 168 in simulated figures of eight, below 2 on straight roads and on a single
 # circle.
 _MIN_SIGNAL_TO_NOISE = 10.0
 
-# A fifth of the drive contains most of the information on an axis if, without this fifth, the
-# variance is more than this multiple. It is below 2 in figures of eight, above 5 with one bend.
+# A fifth of the drive contains most of the information on an axis if the variance without this
+# fifth is larger by this factor. Measured: below 2 in figures of eight, above 5 with a single bend.
 _MAX_CONCENTRATION = 4.0
 
-# Share of the forward motion or of the turns that wheels and sensor do not have in common. Above
-# this share they are probably not of the same drive. It is 0.02 in simulated drives with slip.
+# Wheels and sensor are probably from different drives if they disagree in more than this share of
+# the forward motion or of the turns. Measured: 0.02 in simulated drives with slip.
 _UNRELATED = 0.1
-# Above this share the result is unusable.
+# The result is unusable if they disagree in more than this share.
 _UNUSABLE = 0.3
-# Largest standard deviation (s) of the clock offset, three quarters of its prior. It is at most
-# 12 ms in drives whose wheels slip for 30 % of the time, 83 ms for clocks that differ by 3 s, and
-# up to 300 ms for an articulated machine, which no model describes.
+# Largest standard deviation (s) of the clock offset: three quarters of its prior. Measured: at most
+# 12 ms if the wheels slip for 30 % of the time, 83 ms if the clocks differ by 3 s, up to 300 ms for
+# an articulated machine, which no model describes.
 _MAX_CLOCK_SIGMA_S = 0.15
 
-# The halves of a drive contradict each other above this many joint standard deviations.
+# The two halves of a drive contradict each other above this number of joint standard deviations.
 _MAX_SIGMAS_OF_HALVES = 3.3
 
-# The vehicle always drives the same curve if the turns (rad) of its windows usually deviate from
-# those of a constant curvature by less than this.
+# A vehicle always drives the same curve if the turns (rad) of its windows usually deviate from a
+# constant curvature by less than this ...
 _VARIED_TURN = 0.02
-# The same if the deviations are below this share of the turns (root mean squares): 0.35 to 0.5 in
+# ... or by less than this share of the turns (root mean squares). Measured: 0.35 to 0.5 in
 # simulated figures of eight, at most 0.25 on the spot.
 _VARIED_SHARE = 0.3
 
-# A vehicle turns on the spot if the unit vehicle drives less than this length per radian.
+# A vehicle turns on the spot if its unit vehicle travels less than this length per radian.
 _ON_THE_SPOT = 0.2
 
-# Radii of wheels (m) that are usual, from a small robot to a truck.
+# Usual radii of wheels (m), from a small robot to a truck.
 _USUAL_RADII_M = (0.02, 1.25)
-# Lengths beside which the radius of a wheel is judged.
+# Parameters with which the radius of a wheel is compared.
 _LENGTHS = ("wheel_separation", "wheelbase")
-# Usual radii as shares of these lengths: 0.08 (bus) and 0.11 (car, TurtleBot) to 0.5 (tractor). A
-# usual wheel with a speed in rpm seems to be 9.5 times too small.
+# Usual radii as shares of these lengths: from 0.08 (bus) and 0.11 (car, TurtleBot) to 0.5
+# (tractor). With a speed in rpm, a usual wheel seems to be too small by a factor of 9.5.
 _USUAL_RADII = (0.055, 0.8)
-# Factors of the odometry of wheels that are usual: a wrong radius, but no other unit.
+# Usual multipliers of a wheel odometry. They allow a wrong radius, but not another unit.
 _USUAL_MULTIPLIERS = (0.5, 2.0)
-# Logarithm of the ratio of two radii that is usual: tyre pressure, wear and load change a radius by
-# some percent.
+# Usual log ratio of two radii: tyre pressure, wear and load change a radius by some per cent.
 _USUAL_DEVIATION = 0.1
-# Units of speeds, and the right value divided by the number in this unit.
+# Units of speed, and the factor from a number in this unit to the right value.
 _UNITS = {
     "rpm": np.pi / 30.0,
     "deg/s": np.pi / 180.0,
@@ -118,7 +118,7 @@ _UNITS = {
     "mm/s": 1e-3,
 }
 
-# Options that have no meaning for a vehicle, and the values that are accepted.
+# Options without an effect on vehicles, and their accepted values.
 _ALLOWED: dict[str, tuple[object, ...]] = {
     "method": ("auto", "adaptive"),
     "reference": ("auto",),
@@ -132,7 +132,7 @@ _ALLOWED: dict[str, tuple[object, ...]] = {
 
 
 def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
-    """Estimate the pose of the sensor on the vehicle. The caller adds the names of the frames.
+    """Estimate the pose of the sensor on the vehicle. The caller adds the frame names.
 
     ``cross_check`` has no effect.
 
@@ -163,7 +163,7 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
         fixed.append(Y)
     if _is_flat(drive):
         fixed += TILT
-    # The same drive in longer windows: its difference to the fit enlarges the covariance.
+    # The same drive in longer windows. Its difference from the fit enlarges the covariance.
     longer = _drive(pairs, wheels, config, offset_s, 2.0 * window_s)
     fit = fit_drive(drive, longer, fixed)
     findings = _check_fit(fit, drive, config)
@@ -174,7 +174,7 @@ def _solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
             replace(drive, model=model), replace(longer, model=model), fixed
         )
         if _log_ratio(other, fit) > SIGNIFICANT:
-            # This finding is the cause of all others, and replaces them.
+            # This finding is the cause of all others, so it replaces them.
             findings = (finding(f"speed_of_{rival}"),)
     return _calibration(fit, findings, drive, pairs, offset_s, config)
 
@@ -192,10 +192,10 @@ def _drive(
     offset_s: float,
     window_s: float,
 ) -> Drive:
-    """Return the motions in windows, and the data of the wheels.
+    """Return the motions of the sensor in windows, and the wheel data.
 
-    Windows in which the vehicle rests, and windows with a gap, are skipped. ``offset_s`` is the
-    clock offset of the sensor.
+    Windows at rest, and windows with a gap, are skipped. ``offset_s`` is the clock offset of the
+    sensor.
     """
     start_ns = pairs.stamps_ns[0]
     times_s = np.asarray((pairs.stamps_ns - start_ns) * 1e-9, dtype=float)
@@ -211,11 +211,11 @@ def _drive(
     has_no_gap = np.diff(times_s[ends]) < window_s + config.max_gap
     is_used = (is_moving | is_turning) & has_no_gap
     xi = xi[is_used]
-    # The stamps of pairs already contain the offset of the options.
+    # The stamps of the pairs already contain the clock offset of the options.
     clock_s = times_s[ends] + offset_s - config.given_time_offset_s
     model = MODELS.get(config.parent_measures)
-    # Without wheels, forward motion and turns are not known. Poses of two dimensions have neither
-    # upward motion nor roll and pitch.
+    # Without wheels, forward motion and turns have no measurement. Two-dimensional poses have no
+    # upward motion, roll or pitch.
     components = [1, 2, 3, 4] if model is None else [0, 1, 2, 3, 4, 5]
     if np.abs(xi[:, 2:5]).max(initial=0.0) < _FLAT:
         components = [index for index in components if index not in (2, 3, 4)]
@@ -235,7 +235,7 @@ def _is_clock_fixed(drive: Drive, config: CalibratorConfig) -> bool:
 
 
 def _is_flat(drive: Drive) -> bool:
-    """Whether the poses of the sensor are of two dimensions."""
+    """Return whether the poses of the sensor are two-dimensional."""
     return 2 not in drive.components
 
 
@@ -250,9 +250,9 @@ def _calibration(
     offset_s: float,
     config: CalibratorConfig,
 ) -> Calibration:
-    """Return the result of a fit and of its findings: pose, parameters of the wheels, clock offset.
+    """Return the result for a fit and its findings: pose, parameters of the wheels, clock offset.
 
-    ``offset_s`` is the clock offset that the drive was made with; the fit estimates its remainder.
+    ``offset_s`` is the clock offset with which the drive was made. The fit estimates its remainder.
     """
     kind = "vehicle" if drive.model else "vehicle_alone"
     if _is_flat(drive):
@@ -286,7 +286,7 @@ def _calibration(
     )
     wheels = VehicleParameters(
         tuple(parameters),
-        # The share in the reason of the verdict is the same.
+        # The same share is in the reason of the verdict.
         slip_share=1.0 - result.n_inliers / max(result.n_pairs, 1),
         measures=config.parent_measures,
         nominal_radius_m=config.nominal_radius,
@@ -297,8 +297,8 @@ def _calibration(
 
 
 def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
-    """Return the finding about a wheel of an unusual size, if there is one."""
-    # Odometry has a multiplier of the radius, or of the forward motion.
+    """Return the finding about a wheel of unusual size, or None."""
+    # A wheel odometry has a multiplier of the radius, or of the forward motion.
     size = wheels.radius or wheels.parameters[0].value
     nominal = wheels.nominal_radius_m
     if nominal:
@@ -344,7 +344,7 @@ def _is_usual_radius(wheels: VehicleParameters) -> bool:
 
 
 def _cause_of(ratio: float) -> str:
-    """Return the likely cause of a radius that is ``ratio`` times the right one."""
+    """Return the likely cause of a radius that is wrong by the factor ``ratio``."""
     for unit, factor in _UNITS.items():
         if abs(np.log(ratio / factor)) < _USUAL_DEVIATION:
             return f"speeds in {unit}"
@@ -352,11 +352,11 @@ def _cause_of(ratio: float) -> str:
 
 
 def _assessed(fit: Fit, unknown_axes: Sequence[str]) -> covariance.Assessment:
-    """Return the pose of a fit with its covariance, without the axes that are unknown."""
+    """Return the pose of a fit with its covariance. Unknown axes are marked."""
     T = fit.T_base_sensor
     without_z = fit.covariance[:CLOCK, :CLOCK]
-    # Covariance (6, 6) of the pose in the axes of the vehicle. The row and column of z are 0, since
-    # z is among the unknown axes.
+    # Covariance (6, 6) of the pose in the axes of the vehicle. Row and column of z are 0, because z
+    # is an unknown axis.
     in_base = np.insert(np.insert(without_z, 2, 0.0, axis=0), 2, 0.0, axis=1)
     to_child = se3.block_diagonal(se3.rotation_of(T).T)
     unknown = to_child[:, [AXES.index(axis) for axis in unknown_axes]]
@@ -364,20 +364,20 @@ def _assessed(fit: Fit, unknown_axes: Sequence[str]) -> covariance.Assessment:
 
 
 def _allowance(pairs: PosePairs, config: CalibratorConfig) -> FloatArray:
-    """Return the covariance (6, 6) of constant errors of the sensor that no recording reveals."""
+    """Return the covariance (6, 6) of constant errors of the sensor, which no recording reveals."""
     if config.child_kind != "odometry":
         return np.zeros((6, 6))
     speed_m_s = common_mode.usual_speed(
         pairs.stamps_ns, se3.translation_of(pairs.Ts_cw_c)
     )
-    # The floor is that of two odometries. Here only the sensor has one: half of the floor.
+    # The floor is for two odometries. Only the sensor has one here, so use half of the floor.
     return 0.5 * common_mode.common_mode_floor(speed_m_s)
 
 
 def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
-    """Return the residuals of a fit; ``start_ns`` is the stamp of the first pose.
+    """Return the residuals of a fit. ``start_ns`` is the stamp of the first pose.
 
-    Components that are not compared have the residual zero.
+    The residual of a component that is not compared is zero.
     """
     residuals = np.zeros(drive.xi.shape)
     residuals[:, drive.components] = fit.residuals
@@ -396,12 +396,12 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
 def _check_fit(
     fit: Fit, drive: Drive, config: CalibratorConfig
 ) -> tuple[Finding, ...]:
-    """Return the finding about a fit, if there is one.
+    """Return the finding about a fit, or None.
 
-    It detects drives that do not determine the pose, wheels that are those of another drive,
-    sensors that seem to be upside down, and mounts that moved during the drive.
+    Possible findings: the drive does not determine the pose, the wheels are from another drive, the
+    sensor seems to be upside down, or its mount moved during the drive.
     """
-    # Indices of the unknowns of the axes that are estimated.
+    # Indices of the unknowns for the estimated axes.
     index_of = {"x": 0, "yaw": YAW}
     if drive.model:
         index_of["y"] = Y
@@ -413,7 +413,8 @@ def _check_fit(
     contradicting = _check_wheels(fit, drive, config) if drive.model else ()
     if contradicting:
         return contradicting
-    # The estimate of a half has twice the variance, so the difference of both has four times it.
+    # The estimate of a half has twice the variance. The difference of both halves has four times
+    # the variance.
     sigmas = 2.0 * np.sqrt(np.diag(fit.covariance))
     differences = np.abs(np.subtract(*fit.halves)) / sigmas
     different = [
@@ -431,7 +432,7 @@ def _check_fit(
 def _undetermined_axes(
     fit: Fit, drive: Drive, index_of: Mapping[str, int]
 ) -> list[str]:
-    """Return the axes that the drive does not determine, or only in a part of it."""
+    """Return the axes that the drive, or most of it, does not determine."""
     ratios = fit.signal_to_noise(drive.components)
     undetermined = []
     for axis, index in index_of.items():
@@ -444,7 +445,7 @@ def _undetermined_axes(
 def _check_wheels(
     fit: Fit, drive: Drive, config: CalibratorConfig
 ) -> tuple[Finding, ...]:
-    """Return the finding about wheels of another drive, or about a sensor upside down."""
+    """Return the finding about wheels from another drive, or about a sensor upside down."""
     share = _unrelated_share(fit, drive)
     has_no_clock = fit.covariance[CLOCK, CLOCK] > _MAX_CLOCK_SIGMA_S**2
     if share > _UNRELATED or has_no_clock:
@@ -461,7 +462,7 @@ def _check_wheels(
 
 
 def _is_upside_down(fit: Fit) -> bool:
-    """Whether z of the sensor, or -y of a camera, points down."""
+    """Return whether z of the sensor, or -y of a camera, points down."""
     up = se3.rotation_of(fit.T_base_sensor)[2]
     main = int(np.argmax(np.abs(up)))
     return bool(
@@ -470,7 +471,7 @@ def _is_upside_down(fit: Fit) -> bool:
 
 
 def _has_varied_turns(drive: Drive) -> bool:
-    """Whether the vehicle drives curves of different curvature."""
+    """Return whether the vehicle drives curves of different curvature."""
     lengths = np.linalg.norm(drive.xi[:, :3], axis=1)
     turns = np.linalg.norm(drive.xi[:, 3:], axis=1)
     curvature = lengths @ turns / (lengths @ lengths)
@@ -482,7 +483,7 @@ def _has_varied_turns(drive: Drive) -> bool:
 
 
 def _is_on_the_spot(drive: Drive) -> bool:
-    """Whether the wheels turn the vehicle on the spot."""
+    """Return whether the wheels turn the vehicle on the spot."""
     if drive.model is None:
         return False
     forward, left, turns = np.abs(drive.motions_of_unit_vehicle()).sum(axis=1)
@@ -490,9 +491,9 @@ def _is_on_the_spot(drive: Drive) -> bool:
 
 
 def _unrelated_share(fit: Fit, drive: Drive) -> float:
-    """Return the share of the motion that wheels and sensor do not have in common.
+    """Return the share of the motion in which wheels and sensor disagree.
 
-    This is the larger of the shares of the first component (forward) and the last (turn).
+    It is the larger share of two components: the first (forward) and the last (turn).
     """
     axle = drive.measured(fit.T_base_sensor)[:, drive.components]
     shares = np.sqrt(np.diag(fit.noise) / np.mean(axle**2, axis=0))

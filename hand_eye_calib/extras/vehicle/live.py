@@ -1,4 +1,4 @@
-"""Read wheels and velocities from live messages: each message continues a path in the plane."""
+"""Convert live messages with wheel rates or velocities to poses: a step of a planar path each."""
 
 import cmath
 import math
@@ -16,17 +16,17 @@ _OF_TWISTS = ("wheel_odometry", "omni")
 
 
 class LiveReading(ABC):
-    """Reader of the messages of a live topic, as the path of the unit vehicle (:mod:`.wheels`).
+    """Reader of a live topic whose messages are steps of the unit vehicle's path (:mod:`.wheels`).
 
-    The poses are those of the same messages in a bag. The computation uses plain numbers, because a
-    live message must be read in some microseconds.
+    The poses equal those of the same messages in a bag. The computation uses plain numbers, because
+    it must take only some microseconds per message.
 
     Parameters
     ----------
     measures : str
         Kind of wheel data.
     sensor_frame : str, optional
-        Frame of the vehicle, if the messages do not name it.
+        Frame of the vehicle, if the messages do not have its name.
     """
 
     def __init__(self, measures: str, sensor_frame: str | None = None) -> None:
@@ -34,40 +34,40 @@ class LiveReading(ABC):
         self._sensor_frame = sensor_frame
         self._stamp_ns = 0
         self._values: Sequence[float] = ()
-        # Position (m), complex, and heading (rad) of the unit vehicle.
+        # Position (m) as a complex number, and heading (rad) of the unit vehicle.
         self._position = 0j
         self._heading = 0.0
 
     @abstractmethod
     def _read(self, cursor: Cursor) -> Sequence[float]:
-        """Return the wheel data behind the header of a message.
+        """Return the wheel data after the header of a message.
 
         Raises
         ------
         NoPoseError
-            If the message has no such values.
+            If the message has no wheel data.
         InputError
-            If the values are unclear.
+            If the wheel data are unclear.
         """
 
     def _mean(
         self, earlier: Sequence[float], later: Sequence[float], _: float
     ) -> list[float]:
-        """Return the wheel data between two messages, which are some seconds apart."""
+        """Return the mean wheel data between two messages that are some seconds apart."""
         return [
             (start + end) / 2.0
             for start, end in zip(earlier, later, strict=True)
         ]
 
     def __call__(self, data: bytes) -> PoseFields:
-        """Return the pose after the next message, in CDR.
+        """Return the pose after the next message (in CDR).
 
-        Stamps must increase. After a jump back, the path continues from the last pose.
+        Stamps must increase. If they jump back, the path continues from the last pose.
 
         Raises
         ------
         NoPoseError, InputError
-            If the message has no usable values.
+            If the message has no usable wheel data.
         """
         try:
             cursor = Cursor(data, is_ros1=False)
@@ -96,7 +96,7 @@ class LiveReading(ABC):
         )
 
     def _drive(self, means: Sequence[float], duration_s: float) -> None:
-        """Continue the path by one arc; ``means`` are the wheel data of the duration."""
+        """Continue the path by one arc. ``means`` are the wheel data during the arc."""
         forward, left, turn = (
             float(rate) * duration_s
             for rate in unit_rates(self.measures, means)
@@ -106,7 +106,7 @@ class LiveReading(ABC):
                 f"the wheels turn by more than half a turn of the vehicle within {duration_s:.3g} "
                 "s; publish rad/s and rad"
             )
-        # The chord of an arc, as in :func:`.wheels.path_of`.
+        # Ratio of the chord to the arc, as in :func:`.wheels.path_of`.
         shortening = math.sin(turn / 2.0) / (turn / 2.0) if turn else 1.0
         chord = complex(forward, left) * shortening
         self._position += chord * cmath.exp(1j * (self._heading + turn / 2.0))
@@ -165,7 +165,7 @@ class LiveJoints(LiveReading):
 def _sequence(cursor: Cursor) -> Sequence[float]:
     """Read a sequence of numbers."""
     (length,) = cursor.read("I")
-    # An empty sequence has no padding behind its length.
+    # An empty sequence has no padding after its length.
     values: Sequence[float] = cursor.read(f"{length}d") if length else ()
     return values
 
@@ -176,7 +176,7 @@ def live_reading(message_type: str, topic: str, measures: str) -> LiveReading:
     Raises
     ------
     ConfigError
-        If the messages have velocities, and the kind of wheel data is not set.
+        If the messages have velocities, but the kind of wheel data is not set.
     """
     if message_type == JOINTS_TYPE:
         return LiveJoints(topic, measures)

@@ -1,15 +1,15 @@
-"""Estimated parameters of the wheels of a vehicle, as a part of its result."""
+"""Estimated parameters of a vehicle's wheels, as a part of its result."""
 
 from dataclasses import dataclass
 
-# A radius in this range is taken as a factor: the wheel data are in m/s, not in rad/s. Sizes of
-# wheels usually are within 2 % of the drawing, and only tractors have radii of a metre.
+# A radius in this range counts as a factor: the wheel data are then in m/s instead of rad/s. Wheels
+# usually deviate from the drawing by less than 2 %, and only tractors have radii of a metre.
 _FACTORS = (0.8, 1.25)
 
 
 @dataclass(frozen=True)
 class VehicleParameter:
-    """Parameter of the wheels, with its standard deviation in the same unit."""
+    """Parameter of the wheels, with a standard deviation in the same unit."""
 
     name: str
     value: float
@@ -24,14 +24,15 @@ class VehicleParameters:
     ----------
     parameters : tuple of VehicleParameter
         Lengths are in m, angles in rad, curvatures in 1/m. A radius is in m if the wheel data are
-        in rad/s, and a factor if they are in m/s. A multiplier is the factor by which the value in
-        the configuration of the wheel odometry must be multiplied.
+        in rad/s; it is a factor if they are in m/s. The value in the configuration of the wheel
+        odometry must be multiplied by a multiplier.
     slip_share : float
-        Share of the time (0 to 1) in which wheels and sensor disagree, because the wheels slip.
+        Share of the time (0 to 1) in which wheels and sensor disagree, because wheels slip.
     measures : str
         Kind of wheel data; empty in files of earlier versions.
     nominal_radius_m, nominal_separation_m : float
-        Radius of a wheel, and distance between left and right wheels, by the options; 0 if unknown.
+        Radius of a wheel, and distance between left and right wheels, from the options; 0 if
+        unknown.
     """
 
     parameters: tuple[VehicleParameter, ...]

@@ -1,4 +1,4 @@
-"""The part of results with the parameters of the wheels: lines and files for the user."""
+"""Part of a result with the parameters of the wheels: lines and files for the user."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from hand_eye_calib.core.results.parts import Part
 from hand_eye_calib.extras.vehicle.controllers import controller_text
 from hand_eye_calib.extras.vehicle.parameters import VehicleParameters
 
-# Units of parameters, by the last word of their names. Other parameters are written without a unit.
+# Units of the parameters, by the last word of their names. Other parameters have no unit.
 _UNITS = {
     "separation": " m",
     "wheelbase": " m",
@@ -25,7 +25,7 @@ class WheelPart(Part):
         super().__init__("wheels", lambda: VehicleParameters)
 
     def headline(self, value: VehicleParameters) -> str:
-        """Return the radius of the wheels, which is wrong if speeds have another unit."""
+        """Return the radius of the wheels. It is wrong if speeds have another unit."""
         if not value.radius:
             return ""
         unit = ", a factor for speeds in m/s" if value.is_factor else " m"

@@ -7,10 +7,10 @@ the plane. The residual is
 
     e_i = Log A_i(wheels, clock offset, side slip) - Ad(X) xi_i .
 
-Without wheels, the residual has only the components that must be zero for a vehicle: sideways and
-upward motion, roll and pitch. In curves the axle slips outwards by an angle that is proportional to
-the lateral acceleration (side slip). Windows have weights of Student's t distribution. Windows in
-the tail of this distribution, where the wheels slip, have weight 0. The covariance is the sum of
+Without wheels, the residual has only the components that are zero for a vehicle: sideways and
+upward motion, roll and pitch. In curves the axle slips outwards by an angle in proportion to the
+lateral acceleration (side slip). Windows have weights by Student's t distribution. Windows in the
+tail of this distribution, where wheels slip, have weight 0. The covariance is the sum of
 
 - the tapered jackknife over blocks of time, which contains time-correlated slip. A factor enlarges
   it: the weights depend on the residuals, so the estimate is less certain than with fixed weights;
@@ -36,106 +36,107 @@ from hand_eye_calib.core.base.stats import CHI2, STUDENT, share_of_step
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle.wheels import WheelModel, motions
 
-# Order of the U unknowns. The pose of the sensor: x, y (m) and rotations about the axes x, y, z of
-# the axle (rad). The other unknowns: the clock offset (s), the slip angle per lateral acceleration
-# (rad s^2/m), and the parameters of the wheels.
+# Indices of some of the U unknowns. Order of the unknowns: the pose of the sensor (x, y in m;
+# rotations about the axes x, y, z of the axle in rad), the clock offset (s), the slip angle per
+# lateral acceleration (rad s^2/m), and the parameters of the wheels.
 Y = 1
 TILT = (2, 3)
 YAW = 4
 CLOCK = 5
 
 # Prior standard deviations of the unknowns before the parameters of the wheels, in their units.
-# They keep the iteration in bounds. Only the last is a real prior, that of the slip angle.
+# They keep the iteration in bounds. Only the last one, of the slip angle, is real prior knowledge.
 _PRIOR_SIGMAS = (3.0, 3.0, 1.0, 1.0, 1.0, 0.2, 0.004)
-# Mean of the prior of the slip angle (rad s^2/m): an axle slips outwards, never inwards. That of
-# cars slips by 0.003 to 0.007 rad per m/s^2 (2 to 4 deg per g), that of slow robots with hard tyres
-# by less. So both ends are about one standard deviation away.
+# Prior mean of the slip angle (rad s^2/m). An axle slips outwards, never inwards: by 0.003 to 0.007
+# rad per m/s^2 for cars (2 to 4 deg per g), and by less for slow robots with hard tyres. So both
+# ends are about one standard deviation away from the mean.
 _PRIOR_SLIP = 0.003
 # Number of unknowns before the parameters of the wheels.
 N_FIXED = len(_PRIOR_SIGMAS)
-# Prior standard deviation of a parameter of the wheels: this share of its first value ...
+# Prior standard deviation of a wheel parameter: this share of its starting value ...
 _PARAMETER_SHARE = 0.3
 # ... plus this value, in the unit of the parameter.
 _PARAMETER_SIGMA = 0.03
-# Prior standard deviation of an unknown that keeps its first value, in its unit.
+# Prior standard deviation of an unknown that keeps its starting value, in its unit.
 _FIXED_SIGMA = 1e-6
 
-# Standard deviation of the angle (rad) by which a body leans outwards per lateral acceleration
-# (m/s^2): the roll gradient of cars is 3 to 7 deg per g.
+# Standard deviation of the angle (rad) by which a body leans outwards, per lateral acceleration
+# (m/s^2). The roll gradient of cars is 3 to 7 deg per g.
 _LEAN = 0.01
 
-# Height (m) of the sensor over the axle: a body that leans or pitches moves the sensor by the
-# height times the angle. The height itself is out of reach.
+# Assumed height (m) of the sensor above the axle. A body that leans or pitches moves the sensor by
+# the height times the angle. The height cannot be estimated.
 _HEIGHT = 1.0
 
 # Index of pitch in the residual e.
 _PITCH = 4
 
-# Number of blocks of a drive. A block lasts some seconds, longer than a slip of the wheels.
+# Number of blocks of a drive. A block lasts for some seconds, which is longer than a slip.
 BLOCKS = 30
-# Number of blocks of the jackknife, 9 s each in three minutes. The part that is left out lasts two
-# blocks: longer than a curve to each side. Errors that change sign with the curve, such as those of
-# a body that leans outwards, then cancel as in the whole drive. In 76 simulated drives, the
-# standard deviation of roll was 2.0 times the error with 30 blocks, 1.4 times with 20.
+# Number of blocks of the jackknife; a block of a drive of three minutes lasts 9 s. The omitted part
+# lasts two blocks, which is longer than a curve to each side. Then errors that change sign with the
+# curve, such as those of a leaning body, cancel as in the whole drive. In 76 simulated drives, the
+# standard deviation of roll was 2.0 times the error with 30 blocks, and 1.4 times with 20.
 _JACKKNIFE_BLOCKS = 20
 
-# Number of parts of a drive, of which two neighbours together must not contain most information.
+# Number of parts of a drive. Two neighbouring parts must not contain most of the information.
 _PARTS = 10
 
-# A window has weight 0 if noise exceeds its Mahalanobis distance with less than this probability.
+# A window gets weight 0 if its Mahalanobis distance occurs by noise with less than this
+# probability.
 _TAIL = 0.01
 
-# Share of the difference to the estimate over longer windows that is one standard deviation: the
-# slope of the regression of the errors on this difference, in 470 simulated drives.
+# Standard deviation by longer windows, as a share of the difference between the estimates. It is
+# the slope of the regression of the errors on this difference, in 470 simulated drives.
 _SHARE_OF_LONGER = 0.5
-# The same share for the estimate without weights.
+# The same share for the difference from the estimate without weights.
 _SHARE_OF_UNWEIGHTED = 0.15
-# The same share for x, pitch and yaw. Neighbouring windows share a pose, so their errors cancel if
-# they have equal weights: the errors of 500 simulated drives are -0.75 to -1 times this difference.
-# The share of roll and y is that of other unknowns, since lean already enlarges their jackknife.
+# The same share for x, pitch and yaw. Neighbouring windows share a pose, so their errors cancel
+# under equal weights: in 500 simulated drives, the errors are -0.75 to -1 times this difference.
+# Roll and y have the usual share, because lean already enlarges their jackknife.
 _SHARE_OF_EQUAL_WEIGHTS = 0.5
 
-# Sizes of slips, as shares of the speed of a wheel: tyres and rollers slip by 5 to 20 % in curves,
-# and a slip covers three quarters of a window on average.
+# Sizes of slips, as shares of the speed of a wheel. Tyres and rollers slip by 5 to 20 % in curves,
+# and on average a slip covers three quarters of a window.
 _SLIPS = np.array([0.03, 0.075, 0.15])
-# Largest share of slip that is not detected. Near a share of 1, the bias that slip causes in the
-# parameters of the wheels has no limit.
+# Largest share of the slip that may be undetected. Near a share of 1, the bias of the wheel
+# parameters has no limit.
 _MAX_UNDETECTED = 0.75
 # Factor of the argument of a logistic function that is close to the normal distribution.
 _LOGISTIC = 1.702
 
 # Largest number of Gauss-Newton steps.
 _MAX_ROUNDS = 20
-# Number of updates of weights and noise in a step.
+# Number of updates of weights and noise per step.
 _NOISE_ROUNDS = 5
-# The iteration ends if a step is below this number of standard deviations.
+# The iteration ends if the step is below this number of standard deviations.
 _STEP_SIGMAS = 0.01
 # Step of numerical derivatives, in the unit of each unknown.
 _STEP = 1e-6
-# Variance of turns (rad^2) that is assumed if the poses have neither turns nor tilt to compare.
+# Assumed variance of turns (rad^2), if the poses have neither turns nor tilt to compare.
 _TURN_VARIANCE = 1e-6
-# Smallest variance of a component of the residual (m^2 or rad^2), for data without noise.
+# Smallest variance of a component of the residual (m^2 or rad^2). It is for data without noise.
 _MIN_VARIANCE = 1e-14
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Motions of a sensor in K windows, and the data of the wheels.
+    """Motions of a sensor in K windows, and the wheel data.
 
     Attributes
     ----------
     xi : (K, 6) array
         Logarithms (rho, phi) of the motions, in the frame of the sensor.
     ends_s : (2, K) array
-        Times of the start and of the end of the windows.
+        Times of the start and the end of each window.
     stamps_s : (N + 1,) array
         Times of the wheel data.
     steps : (3, N) array
         Steps of the unit vehicle between these times, see :mod:`.wheels`.
     model : WheelModel or None
-        None without wheels.
+        Model of the wheels; None without wheels.
     components : sequence of int
-        Indices of the C components of e (of six) that are compared.
+        Indices of the C compared components of e (of six).
     """
 
     xi: FloatArray
@@ -154,14 +155,14 @@ class Drive:
         return at_ends[:, 1] - at_ends[:, 0]
 
     def measured(self, T: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle, measured by the sensor if its pose is T (4, 4)."""
+        """Return the motions (K, 6) of the axle according to the sensor, for its pose T (4, 4)."""
         return self.xi @ se3.adjoint(T).T
 
     def predicted(self, T: FloatArray, others: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle that the wheels predict.
+        """Return the motions (K, 6) of the axle according to the wheels.
 
         Without wheels, only the side slip is predicted, from the motion of the sensor at the pose
-        T. ``others`` are the unknowns except the pose.
+        T. ``others`` are all unknowns except the pose.
         """
         clock_s, slip = others[:2]
         # Over a length l with the speed v and the turn a, the slip angle is slip * v a / t with the
@@ -190,7 +191,7 @@ class Drive:
         columns = []
         for index, step in enumerate(_STEP * np.eye(CLOCK + len(others))):
             new_T, new_others = apply_step(T, others, step)
-            # The prediction of the wheels does not depend on the pose.
+            # The prediction by the wheels does not depend on the pose.
             if self.model is None or index >= CLOCK:
                 predicted = self.predicted(new_T, new_others)
             columns.append(
@@ -202,7 +203,7 @@ class Drive:
 def apply_step(
     T: FloatArray, others: FloatArray, step: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the pose and the other unknowns after a step (U,) of all unknowns."""
+    """Return the pose and the other unknowns after a step (U,)."""
     rotation = se3.rotation_exp(step[Y + 1 : CLOCK]) @ se3.rotation_of(T)
     translation = se3.translation_of(T) + np.append(step[: Y + 1], 0.0)
     return se3.from_rotation_translation(rotation, translation), others + step[
@@ -219,21 +220,21 @@ class Fit:
     T_base_sensor : (4, 4) array
         Pose of the sensor in the frame of the axle, with z = 0.
     others : (U - 5,) array
-        Unknowns except the pose: clock offset, side slip and parameters of the wheels.
+        All unknowns except the pose: clock offset, side slip and wheel parameters.
     covariance : (U, U) array
         Covariance of all unknowns.
     residuals : (K, C) array
     weights : (K,) array
-        Weights of the windows, from 0 to 1.
+        Weights of the windows, 0 to 1.
     noise : (C, C) array
         Covariance of the residuals.
     information : (U,) array
-        Information on each unknown if all other unknowns are free: the inverse variance.
+        Information on each unknown (inverse variance) if all other unknowns are free.
     concentration : (U,) array
         Largest factor by which the variance of each unknown grows if a fifth of the drive is
-        missing.
+        omitted.
     halves : (2, U) array
-        Estimates from each half of the drive alone, minus the estimate.
+        Estimate from each half of the drive, minus the estimate from the whole drive.
     objective : float
         Weighted sum of squares of the whitened residuals.
     converged : bool
@@ -252,17 +253,17 @@ class Fit:
     converged: bool
 
     def signal_to_noise(self, components: Sequence[int]) -> dict[str, float]:
-        """Return the information on x, y and yaw as a multiple of that of motions of noise only.
+        """Return the information on x, y and yaw as a multiple of the information in noise.
 
-        Noise of the turns looks like turning of the vehicle. Its information makes x and y too
-        small, by the inverse of this multiple. ``components`` are those of the drive.
+        Noise of the turns looks like turns of the vehicle. It makes x and y too small, by the
+        inverse of this multiple. ``components`` are those of the drive.
         """
         variances = dict(
             zip(components, np.diag(self.noise).tolist(), strict=True)
         )
         left = variances[1]
         forward = variances.get(0, left)
-        # Without wheels, the noise of turns is not known: use that of roll.
+        # Without wheels, the noise of the turns is unknown: use the noise of roll.
         turn = variances.get(5, variances.get(3, _TURN_VARIANCE))
         n_windows = len(self.weights)
         return {
@@ -278,9 +279,9 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
     Parameters
     ----------
     drive, longer : Drive
-        The drive in windows, and the same drive in windows twice as long.
+        The drive in its windows, and in windows twice as long.
     fixed : sequence of int
-        Indices of the unknowns that keep their first value.
+        Indices of the unknowns that keep their starting value.
     """
     T, others = start_of(drive)
     # Prior standard deviations of all unknowns.
@@ -308,12 +309,13 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
         )
         covariance = covariance + np.outer(difference, difference)
     ratios = fit.signal_to_noise(drive.components)
-    # Bias of x and y towards zero, from noise of the turns.
+    # Bias of x and y towards zero by noise of the turns.
     bias = np.zeros(len(sigmas))
     bias[:2] = fit.T_base_sensor[:2, 3] / [ratios["x"], ratios["y"]]
     if drive.model is not None:
-        # The fit combines the turns of sensor and wheels, with variances a and b. Then their noise
-        # has the variance ab / (a + b): at most a quarter of a + b, that of their difference.
+        # The fit combines the turns of sensor and wheels, which have variances a and b. The
+        # combination has the variance ab / (a + b), at most a quarter of the variance a + b of
+        # their difference.
         bias /= 4.0
     covariance = covariance + np.outer(bias, bias)
     lean = _LEAN * _lateral_acceleration(drive, fit.T_base_sensor)
@@ -329,14 +331,14 @@ def fit_drive(drive: Drive, longer: Drive, fixed: Sequence[int]) -> Fit:
 
 
 def _variance_of_ramps(drive: Drive, fit: Fit) -> float:
-    """Return the variance of roll (rad^2) from ramps that look like a tilted mount.
+    """Return the variance of roll (rad^2) from ramps that resemble a tilted mount.
 
-    If the mount rolls, each turn has a share of pitch. A vehicle that pitches on ramps in the
-    rhythm of its curves looks the same. The ramps could have come earlier or later in the drive, so
-    the regression of the pitch on the turns scatters as over all shifts in time. The mean square
-    over all shifts is a sum over frequencies (A. V. Oppenheim, R. W. Schafer, *Discrete-time signal
-    processing*, 2009, section 8.6). The mean square for white noise is subtracted, because the
-    jackknife contains it.
+    If the mount rolls, each turn contains a share of pitch. A vehicle that pitches on ramps in the
+    rhythm of its curves looks the same. The ramps could also be earlier or later in the drive.
+    Therefore the regression of the pitch on the turns is computed for all shifts in time. The mean
+    square over all shifts is a sum over frequencies (A. V. Oppenheim, R. W. Schafer, *Discrete-time
+    signal processing*, 2009, section 8.6). The jackknife already contains white noise, so the mean
+    square for white noise is subtracted.
     """
     turns = drive.measured(fit.T_base_sensor)[:, 5]
     pitches = fit.residuals[:, list(drive.components).index(_PITCH)]
@@ -349,11 +351,11 @@ def _variance_of_ramps(drive: Drive, fit: Fit) -> float:
 
 
 def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
-    """Return the bias from undetected slip, as a share (U,) of the difference without weights.
+    """Return the bias (U,) from undetected slip, in units of the difference between two estimates.
 
-    The slip of a wheel changes its motion by the same share as another size of this wheel. If a
-    part p of the slip is not detected, the bias is p times that of an estimate without weights,
-    and p / (1 - p) times the difference of both estimates.
+    The two estimates are with and without weights. The slip of a wheel has the same effect as
+    another size of this wheel. If a share p of the slip is not detected, the bias is p times the
+    bias without weights. That is p / (1 - p) times the difference between both estimates.
     """
     shares = np.full(CLOCK + len(fit.others), _SHARE_OF_UNWEIGHTED)
     shares[[0, TILT[1], YAW]] = _SHARE_OF_EQUAL_WEIGHTS
@@ -363,13 +365,13 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
     threshold = CHI2[_TAIL][n_components]
     columns = drive.rows(fit.T_base_sensor, fit.others)
     for index in range(N_FIXED, N_FIXED + drive.model.n_wheels):
-        # Squared size (K,) of the effect of a slip of 100 %, in standard deviations of the noise.
+        # Squared effect (K,) of a slip of 100 %, in standard deviations of the noise.
         effect = fit.others[index - CLOCK] * columns[..., index]
         squared = (
             np.einsum("kc,cd,kd->k", effect, inverse(fit.noise), effect)
             + _MIN_VARIANCE
         )
-        # Mean and standard deviation of a non-central chi-squared distribution, (3, K).
+        # Mean and standard deviation of a non-central chi-squared distribution (3, K).
         excess = _SLIPS[:, None] ** 2 * squared
         mean = n_components + excess
         sigma = np.sqrt(2.0 * (n_components + 2.0 * excess))
@@ -383,7 +385,7 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
         )
         undetected = min(float(undetected), _MAX_UNDETECTED)
         shares[index] = undetected / (1.0 - undetected)
-    # The same slips bias the other parameters of the wheels.
+    # These slips also bias the other wheel parameters.
     first_other = N_FIXED + drive.model.n_wheels
     of_wheels = shares[N_FIXED:first_other]
     shares[first_other:] = min(_SHARE_OF_UNWEIGHTED, float(of_wheels.min()))
@@ -391,18 +393,18 @@ def _shares_of_unweighted(drive: Drive, fit: Fit) -> FloatArray:
 
 
 def _lateral_acceleration(drive: Drive, T: FloatArray) -> float:
-    """Return the mean lateral acceleration (m/s^2) to the left; small if both curves are driven.
+    """Return the mean lateral acceleration (m/s^2) to the left. Curves to both sides cancel.
 
-    The turns determine roll, so windows are weighted by their squared turns. ``T`` is the pose of
-    the sensor.
+    Windows are weighted by their squared turns, because the turns determine roll. ``T`` is the pose
+    of the sensor.
     """
     axle = drive.measured(T)
     durations_s = drive.ends_s[1] - drive.ends_s[0]
     forward = axle[:, 0]
     turns = axle[:, 5]
     if drive.model is None:
-        # y is unknown without wheels. Its error times the turns is a part of the forward motion:
-        # the part that varies with the turns is removed.
+        # Without wheels, y is unknown. Its error times the turns is a part of the forward motion,
+        # so the part that varies with the turns is removed.
         deviations = turns - turns.mean()
         variation = deviations @ deviations + _MIN_VARIANCE
         forward = forward - (deviations @ forward) / variation * deviations
@@ -416,7 +418,7 @@ def _difference(
     from_T: FloatArray,
     from_others: FloatArray,
 ) -> FloatArray:
-    """Return the step (U,) that leads from the estimate ``from_...`` to the other estimate."""
+    """Return the step (U,) from the estimate ``from_...`` to the other estimate."""
     turn = se3.rotation_log(se3.rotation_of(T) @ se3.rotation_of(from_T).T)
     return np.concatenate([(T - from_T)[:2, 3], turn, others - from_others])
 
@@ -436,17 +438,18 @@ def _solve(
     ----------
     drive : Drive
     start : (4, 4) array
-        Pose from which the iteration starts; also the mean of its prior. Five of its six
-        components are unknowns, because z is not estimated.
+        Pose at which the iteration starts, and mean of its prior. Five of its six components are
+        unknowns; z is not estimated.
     others : (U - 5,) array
-        Values from which the other unknowns start; also the means of their priors.
+        Starting values of the other unknowns, and means of their priors.
     sigmas : (U,) array
         Prior standard deviations of all unknowns.
     is_weighted : bool
-        Whether windows have weights of Student's t distribution.
+        Whether windows have weights by Student's t distribution.
     """
     everything = range(len(sigmas))
-    # Products of the prior equations: information, and its product with the step to the prior mean.
+    # Products of the prior equations: the information, and its product with the step to the prior
+    # mean.
     prior = np.zeros((len(sigmas) + 1, len(sigmas) + 1))
     prior[:-1, :-1] = np.diag(sigmas**-2.0)
     T = start
@@ -494,22 +497,22 @@ def _solve(
 def _tapered_jackknife(windows: Blocks, prior: FloatArray) -> FloatArray:
     """Return the covariance (U, U) of a fit by the tapered jackknife over blocks of time.
 
-    Neighbouring windows share a pose, so their errors are opposite. Such errors cancel in the fit,
-    but not at the ends of a block that is left out. So the share of a window that is left out is a
-    half wave of the cosine, zero at both ends. Neighbouring half waves overlap by half, so the
-    squares of all shares of a window have the sum 1. Reference: H. Kuensch, *The jackknife and the
+    Neighbouring windows share a pose, so their errors are opposite. They cancel in the fit, except
+    at the ends of an omitted block. Therefore the omitted share of the windows is a half wave of
+    the cosine, which is zero at both ends. Neighbouring half waves overlap by half, so that the
+    squares of all shares of a window add up to 1. Reference: H. Kuensch, *The jackknife and the
     bootstrap for general stationary observations*, Annals of Statistics 17, 1989.
 
     Parameters
     ----------
     windows : Blocks
-        Table of each window.
+        Table for each window.
     prior : (U + 1, U + 1) array
         Products of the prior equations.
     """
     everything = range(len(prior) - 1)
     n_windows = len(windows.sums)
-    # Middles of the windows, in blocks since the start.
+    # Middle of each window, in blocks since the start.
     middles = (np.arange(n_windows) + 0.5) * _JACKKNIFE_BLOCKS / n_windows
     distances = np.abs(middles - np.arange(_JACKKNIFE_BLOCKS + 1)[:, None])
     shares = np.cos(np.pi / 2.0 * np.minimum(distances, 1.0))
@@ -538,8 +541,8 @@ def _weights(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weights (K,) of residuals (K, C), and the covariance (C, C) of the residuals.
 
-    ``noise`` is the covariance of the previous step; empty at the first step. Without weights
-    (``is_weighted`` false), all weights are 1.
+    ``noise`` is the covariance from the previous step, and empty at the first step. If
+    ``is_weighted`` is false, all weights are 1.
 
     K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
     distribution*, JASA 84, 1989.
@@ -564,7 +567,7 @@ def _weights(
 
 
 def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
-    """Return a first pose (4, 4) of the sensor, and first values of the other unknowns.
+    """Return a starting pose (4, 4) of the sensor, and starting values of the other unknowns.
 
     The vehicle turns about the vertical, so the main axis of the rotations is up or down. In level
     axes of the sensor, with complex numbers for vectors in the plane, its displacement in a window
@@ -572,8 +575,8 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     lengths, a the turn, and p the position of the sensor. Least squares yields the factors
     ``s exp(-i yaw)`` of m and ``exp(-i yaw) p`` of ``i a``.
 
-    Wheels determine whether the axis is up. Without wheels, z of the sensor (or -y of a camera) is
-    up, and m is the length of d: the vehicle drives ahead.
+    The wheels reveal whether the axis points up. Without wheels, z of the sensor (or -y of a
+    camera) points up, and m is the length of d: the vehicle drives forward.
     """
     rotations = drive.xi[:, 3:]
     axis = np.linalg.eigh(rotations.T @ rotations)[1][:, -1]
@@ -590,7 +593,7 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
         )
     up = np.sign(turn_ratio) * axis
     turns = np.sign(turn_ratio) * turns
-    # Level axes of the sensor: any direction perpendicular to up is the first axis.
+    # The first level axis of the sensor can be any direction perpendicular to up.
     ahead = np.linalg.svd(up[None])[2][1]
     level = np.stack([ahead, np.cross(up, ahead), up])
     x, y, _ = level @ drive.xi[:, :3].T

@@ -21,7 +21,7 @@ from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 from hand_eye_calib.formats.trajectory_files.stamps import stamps_in_ns
 from hand_eye_calib.formats.trajectory_files.table import Table
 
-# Kind of wheel data in a csv file, by the names of its columns after the column of stamps.
+# Kinds of wheel data, by the names of the columns after the stamps.
 _COLUMNS = {
     r"left\w*,right\w*": "wheels",
     r"(speed|v|velocity)\w*,(steering|angle)\w*": "steering",
@@ -32,7 +32,7 @@ _COLUMNS = {
 
 
 def _unit_of(column: str) -> float:
-    """Return the unit of a column by its name; 1 for rad/s, rad and m/s."""
+    """Return the unit of a column from its name; 1 for rad/s, rad and m/s."""
     units = [
         unit for name, unit in _UNITS.items() if column.endswith(f"_{name}")
     ]
@@ -69,7 +69,7 @@ _N_COLUMNS = {
     "omni": 3,
 }
 
-# Units at the end of the name of a column, in rad/s, rad or m/s.
+# Units at the end of a column's name, as factors to rad/s, rad or m/s.
 _UNITS = {
     "rpm": np.pi / 30.0,
     "deg": np.pi / 180.0,
@@ -107,10 +107,10 @@ def wheel_trajectory(
     Raises
     ------
     InputError
-        If the stamps do not increase, the values have another number of columns, or a step turns by
+        If the stamps do not increase, the values have a wrong number of columns, or a step turns by
         more than half a turn.
     ConfigError
-        If ``measures`` is no kind of wheel data.
+        If ``measures`` is not a kind of wheel data.
 
     Examples
     --------
@@ -136,7 +136,7 @@ def wheel_trajectory(
 def unit_rates(measures: str, columns: Iterable[Any]) -> tuple[Any, ...]:
     """Return forward speed, left speed and yaw rate of the unit vehicle from wheel data.
 
-    The columns are numbers or arrays.
+    The arguments are numbers or arrays.
     """
     return _RATES[measures](*columns)
 
@@ -168,7 +168,7 @@ def unit_path(
 def table_of_wheels(
     path: str | Path, data: bytes, options: FileOptions
 ) -> Table | None:
-    """Read a csv file of wheel data as a table of poses of the unit vehicle; None for other files.
+    """Read a csv file of wheel data as poses of the unit vehicle; None for other files.
 
     Raises
     ------
@@ -194,10 +194,10 @@ def table_of_wheels(
         return None
     rows = []
     for line_number, text in enumerate(data.decode().splitlines(), 1):
-        # Without the option `columns`, the first line contains the names.
+        # Without the option `columns`, the first line has the names.
         if text.strip() and (line_number > 1 or options.columns):
             rows.append((line_number, [*text.split(","), "0"]))
-    # The table reads three values as positions. The zero at the end replaces a missing third value.
+    # The table reads three values as positions. A zero at the end replaces a missing third value.
     n_values = names.count(",") + 1
     rates = Table(path, (stamp, "x", "y", "z"), "positions")
     rates.fill(rows, lambda cells: cells[:4])

@@ -8,10 +8,10 @@ a model with the parameters of the real wheels computes the step of the axle (m,
   forward = (R_l l + R_r r) / 2,  turn = (R_r r - R_l l) / track.
 - Odometry of two wheels, with multipliers k and k_track and an additional curvature:
   forward = k dx,  turn = k da / k_track + curvature forward.
-- Steering: dx and da are the speed of the wheels times the cosine and the sine of the angle of the
-  steered wheel, with an offset o of this angle. The speed is that of the fixed axle:
+- Steering: dx and da are the speed of the fixed axle, times the cosine and the sine of the steering
+  angle. The steering angle has an offset o:
   forward = R sqrt(dx^2 + da^2) sign(dx),  turn = forward tan(angle - o) / wheelbase.
-- A tricycle, whose steered wheel is the driven one, so that the speed is that of this wheel:
+- A tricycle, which drives its steered wheel: the same with the speed of this wheel:
   forward = R (dx cos o + da sin o),  turn = R (da cos o - dx sin o) / wheelbase.
 - Omnidirectional, with multipliers: forward = k_x dx,  left = k_y dy,  turn = k_a da.
 
@@ -30,12 +30,11 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 
-# Track of the unit vehicle, as a multiple of the radius of its wheels. A usual robot has the same
-# ratio, so that its turns have a usual size.
+# Track of the unit vehicle, in radii of its wheels. Usual robots have this ratio, so the turns have
+# a usual size.
 UNIT_TRACK = 5.0
 
-# Added to lengths (unit of the wheel data) before a division by them, because a vehicle at rest has
-# the length 0.
+# Added to a length before a division by it. The length is 0 for a vehicle at rest.
 _SMALL = 1e-12
 
 
@@ -49,11 +48,11 @@ class WheelModel(NamedTuple):
     steps_of : callable
         ``steps_of(parameters, dx, dy, da)`` returns forward, left and turn (N,) of the axle.
     parameters_of : callable
-        First values (P,) of the parameters. ``parameters_of(length, turn)`` computes them from the
-        ratios of the lengths and of the turns of the axle to those of the unit vehicle. Both wheels
-        get the same radius.
+        Function ``parameters_of(length, turn)``, which returns starting values (P,) of the
+        parameters. Its arguments are the motion of the axle divided by the motion of the unit
+        vehicle: length and turn. Both wheels get the same radius.
     n_wheels : int
-        Number of parameters, the first ones, that are sizes of wheels which may slip.
+        Number of parameters (the first ones) that are sizes of wheels, which may slip.
     """
 
     names: tuple[str, ...]
@@ -110,8 +109,8 @@ def _omni(
     return forward_factor * dx, left_factor * dy, turn_factor * da
 
 
-#: Models by the kind of wheel data. Parameters that ``diff_drive_controller`` also has are named
-#: like there.
+#: Models by the kind of wheel data. Parameters that ``diff_drive_controller`` has, too, have the
+#: same names.
 MODELS = {
     "wheels": WheelModel(
         ("left_wheel_radius", "right_wheel_radius", "wheel_separation"),
@@ -142,19 +141,19 @@ MODELS = {
     ),
 }
 
-#: Kinds of wheel data with the same columns, which are easily mistaken for each other.
+#: Kinds of wheel data whose columns are the same, so that users easily confuse them.
 RIVALS = {"steering": "tricycle", "tricycle": "steering"}
 
 
 def path_of(steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the positions (N + 1,), complex, and headings (N + 1,), rad, after steps (3, N).
 
-    A step is an arc: forward and left are along the arc, and the turn is constant per length. The
-    path begins at 0 with the heading 0.
+    A step is an arc of constant curvature. Forward and left are lengths along the arc. The path
+    begins at 0 with the heading 0.
     """
     forward, left, turns = steps
     headings = np.append(0.0, np.cumsum(turns))
-    # The chord of an arc has the direction of its middle, and the length of the arc times
+    # The chord of an arc is parallel to the arc at its middle. Its length is that of the arc times
     # sin(turn / 2) / (turn / 2). numpy's sinc(x) is sin(pi x) / (pi x).
     middle_directions = np.exp(1j * (headings[:-1] + turns / 2.0))
     shortening = np.sinc(turns / (2.0 * np.pi))
@@ -168,8 +167,8 @@ def steps_between(
 ) -> FloatArray:
     """Return the steps (3, N) with these chords; the inverse of :func:`path_of`.
 
-    ``chords`` (N,) are the displacements, complex, ``headings`` (N,) those at the start of each
-    step, and ``turns`` (N,) those of the steps, rad.
+    ``chords`` (N,) are the displacements as complex numbers, ``headings`` (N,) the headings at the
+    start of each step, and ``turns`` (N,) the turns of the steps, rad.
     """
     arcs = (
         chords
@@ -205,7 +204,7 @@ def steps_of(trajectory: Trajectory) -> FloatArray:
 def motions(
     stamps_s: FloatArray, steps: FloatArray, ends_s: FloatArray
 ) -> FloatArray:
-    """Return the motion (3, K) in each window: forward, left and turn along one arc.
+    """Return the motion (3, K) of each window as one arc: forward, left and turn.
 
     Parameters
     ----------
@@ -213,7 +212,7 @@ def motions(
     steps : (3, N) array
         Steps of the axle between the stamps.
     ends_s : (2, K) array
-        Times of the start and of the end of the windows.
+        Times of the start and the end of each window.
     """
     positions, headings = path_of(steps)
     start, end = np.interp(ends_s, stamps_s, positions)
