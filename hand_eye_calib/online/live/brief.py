@@ -1,4 +1,4 @@
-"""Short sentences for a person at the machine, who reads them aloud in one breath.
+"""Short sentences for a person at the machine, who can read one aloud in a breath.
 
 Longer texts, with values and parameters, are in the log and on the page below the headline.
 """
@@ -72,7 +72,7 @@ _OF_FINDINGS = {
 
 
 def in_one_breath(text: str, otherwise: str) -> str:
-    """Return a text if a person can read it aloud in one breath, otherwise another text."""
+    """Return a text that a person can read aloud in a breath; otherwise the other text."""
     return text if len(text.split()) <= MAX_WORDS else otherwise
 
 
@@ -99,7 +99,7 @@ def of_reason(reason: Reason) -> Brief:
 def step_after(finding: Finding) -> str:
     """Return the next step after a finding in the streams of a session.
 
-    The poses of the session keep an error, so a repair of the source needs a reset.
+    The session keeps the faulty poses. Therefore a repair of the source also needs a reset.
     """
     if finding.options:
         settings = [
@@ -117,7 +117,7 @@ def step_after(finding: Finding) -> str:
 
 
 def publishers_in_words(names: Iterable[str]) -> str:
-    """Return number and nodes of the publishers of a topic; each node is named once."""
+    """Return number and nodes of a topic's publishers. Each node is named once."""
     counts = Counter(names)
     number = counts.total()
     if len(counts) == 1:

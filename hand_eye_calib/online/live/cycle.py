@@ -1,4 +1,4 @@
-"""Solves and stream checks of a live session: when they run, and what becomes of their results.
+"""Solves and stream checks of a live session: when they run, and how their results are used.
 
 Solves run in a process of their own, see ``solving.py``. A :class:`SolveCycle` sends a copy of the
 engine to this process as soon as there are new poses, receives the answer, and decides whether the
@@ -79,11 +79,12 @@ OnSolved: TypeAlias = Callable[[bool, str], None]
 # Shortest time between two stream checks (s). A check takes one or two seconds.
 _CHECK_PERIOD_S = 30.0
 
-# Shortest time between two stream checks in durations of a solve: a check prolongs a solve by a
-# half, so on a busy computer most solves are done without a check.
+# Shortest time between two stream checks, as a multiple of the duration of a solve. A check
+# prolongs a solve by a half. So on a busy computer most solves have no check.
 _SOLVES_PER_CHECK = 4.0
 
-# Poses of each stream from which streams without pairs have a fault, and have not just begun.
+# Streams without pairs have a fault if each has at least this number of poses; with fewer, they
+# have just begun.
 _MANY_UNPAIRED = 50
 
 # Options that change the verdict on a result, but not the result.
@@ -91,20 +92,20 @@ _TARGETS = ("target_translation", "target_rotation", "target_axes")
 
 
 class SolveCycle:
-    """Sends jobs to the solving process, and keeps the result of the session.
+    """Send jobs to the solving process, and store the result of the session.
 
-    At most one job runs at a time. The answer to a job of an older session is dropped.
+    At most one job runs at a time. An answer to a job of an older session is dropped.
 
     Parameters
     ----------
     session : LiveSession
     log : NodeLog
     wake : callable
-        Called in another thread when an answer arrives for :meth:`take_answers`.
+        Function that is called in another thread when an answer arrives for :meth:`take_answers`.
     complete : callable
-        Called with a usable Calibration; returns the Calibration with additions of the node.
+        Function that gets a usable Calibration, and returns it with additions of the node.
     publish : callable
-        Called after an answer is processed, before the callbacks of :meth:`ask`.
+        Function that is called after an answer was processed, before the callbacks of :meth:`ask`.
     targets : (6,) sequence
         Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
 
@@ -112,9 +113,9 @@ class SolveCycle:
     ----------
     is_solving : bool
     result : Calibration or None
-        Result of the session: the newest usable result or, once the goal is reached, the best
-        result of the goal. If a newer result was worse, the warnings name its values. If the motion
-        contradicts a prior, this is a result with the verdict DO NOT USE.
+        Result of the session: the newest usable result, or the best result after the goal is
+        reached. If a newer result was worse, the warnings contain its values. If the motion
+        contradicts a prior, the result has the verdict DO NOT USE.
     """
 
     def __init__(
@@ -138,12 +139,13 @@ class SolveCycle:
         self._rest_until_s = 0.0
         # Start of the newest job (steady time, s).
         self._started_s = 0.0
-        # Duration and processor time of the last job that has ended (s).
+        # Duration and processor time of the last finished job (s).
         self._job_s = 0.0
         self._job_processor_s = 0.0
         # Callbacks that wait for a solve, with the time of the request (steady time, s).
         self._waiting: dict[OnSolved, float] = {}
-        # Callbacks that were waiting when the current job started; its answer goes to them.
+        # Callbacks that the answer to the current job must call. They were waiting when the job
+        # started.
         self._in_job: tuple[OnSolved, ...] = ()
         self._process = SolvingProcess(wake)
         self.restart()
@@ -151,7 +153,7 @@ class SolveCycle:
     def restart(self) -> None:
         """Begin a new session without a result."""
         self.result: Calibration | None = None
-        # Copy of the engine from which the result was computed, and options that checks had set.
+        # Copy of the engine with the poses of the result, and options that checks had set.
         self._solved: tuple[Calibrator, Options] | None = None
         self._solved_at_s = 0.0
         # Motion of the session so far.
@@ -160,12 +162,12 @@ class SolveCycle:
         self._newest_motion: Excitation | None = None
         # Failure of the newest solve.
         self._failure: Failure | None = None
-        # Time of the first failure (steady time, s) if every solve since the result has failed.
+        # Time of the first failure (steady time, s), if all solves since the result have failed.
         self._failing_since_s: float | None = None
         # Options that checks of this session have set, and the warnings about these options.
         self._check_options: Options = {}
         self._option_warnings: tuple[str, ...] = ()
-        # Whether there are poses or options that no check has used.
+        # Whether poses or options have come that no check has used.
         self._is_unchecked = False
         # Earliest time of the next check (steady time, s).
         self._check_due_s = 0.0
@@ -178,8 +180,8 @@ class SolveCycle:
     ) -> None:
         """Apply changed options; check the streams again at once.
 
-        If only targets have changed, the result stays and its verdict is computed anew, because the
-        robot may be parked by now. Otherwise the goal starts over.
+        If only targets have changed, the result is kept, because the robot may be parked. Its
+        verdict is computed again. Otherwise the goal starts again.
 
         Parameters
         ----------
@@ -208,7 +210,7 @@ class SolveCycle:
 
     @property
     def published(self) -> Calibration | None:
-        """Result to publish; None if there is none, or if the result is refuted."""
+        """Result to publish; None if there is none, or if it is refuted."""
         return (
             None
             if self.result is None or is_refuted(self.result)
@@ -258,7 +260,7 @@ class SolveCycle:
     def result_to_save(self) -> Calibration | None:
         """Return the result; None if there is none.
 
-        If every later solve has failed, the result has a warning about this failure.
+        If all later solves have failed, the result gets a warning about this failure.
         """
         if self.result is None or self.standing is not Standing.OUTDATED:
             return self.result
@@ -267,7 +269,7 @@ class SolveCycle:
         )
 
     def snapshot(self) -> Snapshot | None:
-        """Return the poses and options from which the result was computed; None without one."""
+        """Return the poses and options of the result; None without a result."""
         if self._solved is None:
             return None
         calibrator, options = self._solved
@@ -282,7 +284,7 @@ class SolveCycle:
             self._start()
 
     def answer_overdue(self) -> None:
-        """Answer the callers that have waited too long, while the solve goes on.
+        """Answer callers that have waited too long, although the solve still runs.
 
         This method must be called often.
         """
@@ -312,7 +314,7 @@ class SolveCycle:
             self.is_solving = False
             self._publish()
             for on_solved in self._in_job:
-                # A caller that has waited too long has an answer already.
+                # A caller that waited too long already has an answer.
                 if self._waiting.pop(on_solved, None) is not None:
                     on_solved(is_good, text)
             self._in_job = ()
@@ -359,8 +361,9 @@ class SolveCycle:
                 False,
                 "the session was reset during the solve: the result is dropped",
             )
-        # Pause for the processor time of the solve, so that half of the processor time stays free.
-        # On a busy computer, the solve takes much longer than this, and no longer pause is needed.
+        # Pause for the processor time of the solve, so that half of the processor stays free. On a
+        # busy computer, the solve takes much longer than its processor time, so this pause
+        # suffices.
         self._rest_until_s = time.monotonic() + answer.processor_s
         self._job_s = answer.seconds
         self._job_processor_s = answer.processor_s
@@ -392,10 +395,10 @@ class SolveCycle:
         return self._take(self._complete(newest))
 
     def _advice_after_failure(self) -> tuple[str, tuple[str, ...]]:
-        """Return what to do after a failed solve, and axes that may be measured by hand.
+        """Return advice after a failed solve, and axes that may be measured by hand.
 
-        After a short motion, the advice is to move on. Then it is the motion that is missing; if
-        none is, it is the reason of the failure.
+        After a short motion, the advice is to continue. Later the advice names the missing motion,
+        or else the reason of the failure.
         """
         motion = self._motion
         statistics = map(self._session.calibrator.statistics, STREAMS)
@@ -422,7 +425,7 @@ class SolveCycle:
 
     def _take_motion(self, answer: Answer) -> None:
         """Store motion and clock offset of an answer."""
-        # The estimated rotation can decrease with more poses, so keep the largest so far.
+        # More poses can decrease the estimated rotation. Keep the largest value so far.
         rotation = np.maximum(self._motion.rotation, answer.motion.rotation)
         self._motion = replace(answer.motion, rotation=rotation)
         self._newest_motion = answer.newest_motion
@@ -448,9 +451,9 @@ class SolveCycle:
             self._failing_since_s = time.monotonic()
 
     def _refute(self, newest: Calibration) -> Outcome:
-        """Replace the result by a calibration whose prior the motion contradicts.
+        """Replace the result by a calibration with a prior that the motion contradicts.
 
-        From now on, the earlier result is neither published nor saved.
+        The earlier result is then neither published nor saved.
         """
         self.goal.add(newest, self._motion, self.checks.faults())
         self._solved = self._submitted, self._check_options
@@ -464,7 +467,7 @@ class SolveCycle:
         self._failing_since_s = None
 
     def _take(self, newest: Calibration) -> Outcome:
-        """Make a usable calibration the session's result, unless the goal has a better one."""
+        """Make a usable calibration the result of the session, unless the goal has a better one."""
         was_done = self.goal.progress.done
         faults = self.checks.faults()
         progress = self.goal.add(
@@ -490,8 +493,8 @@ class SolveCycle:
     def _with_findings(self, calibration: Calibration) -> Calibration:
         """Return the calibration with the findings of the stream checks.
 
-        A calibration from positions, rotations or rates has findings of its own. To these, only
-        findings about the received poses are added.
+        A calibration from positions, rotations or rates has findings of its own. Only findings
+        about the received poses are added to these.
         """
         findings = self.checks.findings
         if calibration.measured != "poses":
@@ -517,7 +520,7 @@ class SolveCycle:
         accepts_poses : bool
             Whether the inputs accept poses.
         tf_static : tuple of Broadcast and str
-            Whether the result is broadcast on /tf_static, and the reason if it is not.
+            Whether the result is broadcast on /tf_static, and if not, the reason.
         """
         motion = self._motion
         level, text = self._condition(accepts_poses, tf_static)
@@ -550,7 +553,7 @@ class SolveCycle:
         )
 
     def _slow_in_words(self) -> str:
-        """Return a sentence about solves that take long, and the reason; empty if they do not."""
+        """Return a sentence about slow solves with the reason; empty if solves are fast."""
         running_s = (
             time.monotonic() - self._started_s if self.is_solving else 0.0
         )
@@ -610,7 +613,7 @@ class SolveCycle:
     ) -> ProgressState:
         """Return the diagnostics of the progress towards the targets.
 
-        The level is OK if the person should continue the motion, otherwise WARN.
+        The level is OK if the person should continue the motion; otherwise WARN.
 
         Parameters
         ----------
@@ -642,7 +645,7 @@ class SolveCycle:
         )
 
     def _comparison(self, why_not: str) -> Comparison | None:
-        """Return the comparison with the installed transform, or why there is none yet."""
+        """Return the comparison with the installed transform, or the reason why it is missing."""
         if self.result is not None and self.result.comparison is not None:
             return with_axis_keys(self.result.comparison)
         return (

@@ -1,4 +1,4 @@
-"""Texts and values about the results of a session, for the state of the node and the log."""
+"""Texts and values about the results of a session, for the state and the log of the node."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,18 +25,18 @@ from hand_eye_calib.online.live.state import (
     as_printed,
 )
 
-# A first result is accepted after this duration of motion (s), or after this rotation (rad). Before
-# that, estimates and advice jump.
+# A first result is accepted after this duration of motion (s). Earlier estimates and advice jump.
 _MIN_MOTION_S = 20.0
+# A first result is also accepted after this rotation (rad).
 _MIN_ROTATION_RAD = float(np.radians(30.0))
 
 # Advice while both streams have poses that cannot be paired.
 NO_PAIRS = "The poses of both sensors do not pair. Compare their clocks and their rates."
 
-# Solves that last longer than this (s) are reported, because advice and time left refer to the data
-# before the solve.
+# Solves that take longer than this (s) are reported, because advice and time left then refer to
+# older data.
 _SLOW_SOLVE_S = 10.0
-# Share of a processor that a solve gets, below which other programs keep the processor busy.
+# If a solve gets less than this share of a processor, other programs keep the processor busy.
 _BUSY_SHARE = 0.5
 
 
@@ -45,7 +45,7 @@ def pause_of(
 ) -> Condition:
     """Return level and reason if no poses arrive; otherwise level OK and an empty text.
 
-    The level is OK if every input rests and its state permits that: the robot is parked.
+    The level is OK if every input is silent and permitted to be silent: the robot is parked.
     """
     if not accepts_poses:
         return (
@@ -85,7 +85,7 @@ def has_just_begun(motion: Excitation) -> bool:
 
 
 def too_little_in_words(motion: Excitation) -> str:
-    """Return a sentence about the motion that a first result needs, and the motion so far."""
+    """Return a sentence about the motion needed for a first result, and the motion so far."""
     if not is_too_little(motion):
         return f"No result yet after {motion.motion_s:.0f} s of motion: keep moving."
     rotation_deg = np.floor(np.degrees(motion.rotation.max()))
@@ -97,19 +97,19 @@ def too_little_in_words(motion: Excitation) -> str:
 
 
 def is_held_up(seconds: float, processor_s: float) -> bool:
-    """Whether a solve took long, and waited for the processor for more than half of the time."""
+    """Return whether a solve took long, and waited for the processor most of this time."""
     return seconds >= _SLOW_SOLVE_S and processor_s < _BUSY_SHARE * seconds
 
 
 def slow_in_words(
     seconds: float, last_s: float, last_processor_s: float
 ) -> str:
-    """Return a sentence about solves that take long, and the reason; empty if they do not.
+    """Return a sentence about slow solves with the reason; empty if solves are fast.
 
     Parameters
     ----------
     seconds : float
-        Longest duration of the last solve and of the running solve (s).
+        Longer duration of two solves (s): the last one and the running one.
     last_s, last_processor_s : float
         Duration and processor time of the last solve (s).
     """
@@ -117,14 +117,14 @@ def slow_in_words(
         return ""
     is_busy = is_held_up(last_s, last_processor_s) or last_s < _SLOW_SOLVE_S
     word = "busy" if is_busy else "slow"
-    # Whole tens: the sentence does not change with every second of a running solve.
+    # Round to tens of seconds, so that the sentence does not change every second.
     return f"The computer is {word}: a result takes {duration(10.0 * (seconds // 10.0))}."
 
 
 def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
-    """Return the kept result with the newest difference between both halves of the recording.
+    """Return the kept result with the newest difference between both halves of the session.
 
-    The cross-check solves both halves apart. Its newest values contain all poses so far.
+    The cross-check solves each half on its own. Its newest values include all poses so far.
     """
     if newest.cross_check is None or kept.cross_check is None:
         return kept
@@ -139,7 +139,7 @@ def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
 
 
 def with_axis_keys(comparison: Comparison) -> Comparison:
-    """Return the comparison with its differences by the axis names of topics, ``AXIS_KEYS``."""
+    """Return the comparison, with the axis names of topics (``AXIS_KEYS``) in its differences."""
     differences = []
     for difference in comparison.differences:
         axes = {AXIS_KEYS[axis]: row for axis, row in difference.axes.items()}
@@ -155,7 +155,7 @@ def is_refuted(result: Calibration) -> bool:
 
 
 def priors_of(config: CalibratorConfig) -> dict[str, str]:
-    """Return the priors that are set, by axis, as the user has typed them."""
+    """Return the priors that are set, by axis, in the form in which the user typed them."""
     priors = {axis: getattr(config, f"prior_{axis}") for axis in AXES}
     return {axis: text for axis, text in priors.items() if text}
 

@@ -46,31 +46,32 @@ from hand_eye_calib.online.live.progress import (
     Progress,
 )
 
-# Bounds of the motion (s) that confirms a first result within the targets. Within these bounds, the
-# motion is as long as the motion of that result.
+# Bounds of the motion (s) that confirms a first result within the targets. Between these bounds, it
+# equals the motion before that result.
 _MIN_CONFIRMATION_S = 20.0
 _MAX_CONFIRMATION_S = 75.0
 
-# Shortest motion (s) of a session in which the motion may be called useless for an axis, and
-# between two results from which a rate of information is computed. Ramps are about this time apart.
+# Shortest motion (s) of a session after which the motion may be called useless for an axis. Also
+# the shortest motion between two results from which a rate of information is computed. It is about
+# the time between two ramps.
 _MIN_MOTION_TO_JUDGE_S = 30.0
 
-# Values (s) to which a reported time left is rounded. Beyond the last finite step, the present
+# Values (s) to which the reported time left is rounded. Beyond the last finite value, the present
 # motion cannot reach the target.
 _STEPS_S = np.array(
     [0.0, 15, 30, 60, 90, 120, 180, 240, 360, 600, 900, 1200, np.inf]
 )
 
-# Values (s) to which the time of a confirmation is rounded up: it is known, not estimated.
+# Values (s) to which the time of a confirmation is rounded up. This time is exact, not estimated.
 _CONFIRMING_STEPS_S = np.array([4.0, 8, 12, 16, 20, 30, 40, 50, 60, 75])
 
-# Largest decrease of a reported time left from result to result, in steps.
+# Largest decrease of the reported time left between two results, in steps.
 _MAX_DECREASE_STEPS = 2
-# The reported time left increases only if the new time left is longer by this number of steps.
+# The reported time left increases only if the new value is longer by at least this number of steps.
 _MIN_INCREASE_STEPS = 3
 
-# Largest ratio of standard deviations, newest to best result, at which the newest result replaces
-# the best. Standard deviations are estimates, and the newest result has more motion.
+# The newest result replaces the best result if its standard deviations are at most larger by this
+# factor. Standard deviations are estimates, and the newest result has more motion.
 _MAX_RATIO_TO_BEST = 1.25
 
 # Target standard deviations of x, y, z (m), roll, pitch and yaw (rad).
@@ -90,7 +91,7 @@ class _Result:
     sigmas_measured : (6,) array
         Standard deviations without the allowance (m, rad).
     allowance : (6,) array
-        Allowance for constant errors (m, rad); infinite if options have changed since.
+        Allowance for constant errors (m, rad); infinite after a change of options.
     is_usable : bool
         Whether the solve succeeded and the streams had no faults.
     """
@@ -102,7 +103,7 @@ class _Result:
 
 
 class Goal:
-    """Compares each new result of a session with the targets, and keeps the best result.
+    """Compare each new result of a session with the targets, and keep the best result.
 
     Once the goal is reached, it stays reached until the motion contradicts a prior or the options
     change.
@@ -115,8 +116,8 @@ class Goal:
     Attributes
     ----------
     best : Calibration or None
-        Newest result within the targets, or an earlier one that is clearly better. None before
-        the goal is reached.
+        Newest result within the targets, unless an earlier one is clearly better. None before the
+        goal is reached.
     progress : Progress
     """
 
@@ -126,8 +127,8 @@ class Goal:
 
     def restart(self) -> None:
         """Begin a new session."""
-        # Results of the last minutes of motion, as many as a confirmation needs. The motion
-        # increases from result to result.
+        # Results of the last minutes of motion, as many as a confirmation needs. They are in the
+        # order of their motion.
         self._results: list[_Result] = []
         # Motion of the newest result, and faults of its streams.
         self._motion: Excitation | None = None
@@ -139,16 +140,16 @@ class Goal:
     def _start_over(self, sentence: str) -> None:
         """Reset the best result and the progress; the list of results stays."""
         self.best: Calibration | None = None
-        # Standard deviation of the best result in units of the target, on its worst axis.
+        # Largest standard deviation of the best result, in units of its target.
         self._best_ratio = np.inf
-        # Reported times left, of six axes and in all, as indices of _STEPS_S.
+        # Reported times left, of six axes and of the whole goal, as indices of _STEPS_S.
         self._steps = np.full(7, len(_STEPS_S) - 1)
         self.progress = self._nothing_yet(sentence)
 
     def wait(self, sentence: str, by_hand: tuple[str, ...] = ()) -> None:
-        """Use a sentence as the progress of a session without a result; otherwise ignore it.
+        """Use a sentence as the progress if the session has no result; otherwise ignore it.
 
-        ``by_hand`` are the axes that the sentence proposes to measure by hand.
+        ``by_hand`` has the axes for which the sentence proposes a measurement by hand.
         """
         if self._motion is None:
             self.progress = replace(
@@ -158,7 +159,7 @@ class Goal:
     def follow(self, targets: Targets) -> None:
         """Start over with new targets, because options have changed.
 
-        The robot may be parked by now, so earlier results can still confirm the next result.
+        The robot may be parked, so earlier results can still confirm the next result.
         """
         self._targets = np.asarray(targets, dtype=float)
         has_result = self._motion is not None
@@ -201,11 +202,11 @@ class Goal:
         motion : Excitation
             The motion of the result.
         faults : sequence of str
-            Findings of the stream checks. The goal is not reached while there are any.
+            Findings of the stream checks. With any finding, the goal is not reached.
         newest_motion : Excitation, optional
             The motion of the last minute. Default: ``motion``.
         period_s : float
-            Time until the next result (s): a confirmation takes at least as long.
+            Time until the next result (s). A confirmation takes at least as long.
         """
         self._motion = motion
         self._period_s = period_s
@@ -228,7 +229,7 @@ class Goal:
     def _append(self, calibration: Calibration, motion_s: float) -> None:
         """Store a result that may confirm later results.
 
-        If the robot is parked, the motion is the same: the result then replaces the newest one.
+        If the robot is parked, the motion is unchanged, and the result replaces the newest one.
         """
         if self._results and motion_s <= self._results[-1].motion_s:
             motion_s = self._results.pop().motion_s
@@ -250,18 +251,18 @@ class Goal:
     ) -> FloatArray:
         """Return measured variances (6,) divided by ``target**2 - allowance**2``.
 
-        An axis is within its target if the ratio is at most 1. The ratio is infinite if the
-        allowance alone exceeds the target. It is 0 if more motion cannot improve the axis: the axis
-        has a prior, or the streams do not measure it.
+        An axis is within its target if its ratio is at most 1. The ratio is infinite if the
+        allowance alone exceeds the target. It is 0 if more motion cannot improve the axis: it has a
+        prior, or the streams do not measure it.
 
         Parameters
         ----------
         newest : Calibration
             Its priors are used, because options may have changed since an earlier result.
         earlier : _Result, optional
-            An earlier result with its standard deviations and the smaller of both allowances: the
-            allowance is an estimate that varies from result to result, and a confirmation must not
-            begin anew because the newest allowance is larger. Default: the newest result.
+            Earlier result, whose standard deviations are used, with the smaller of both allowances.
+            The allowance is an estimate that varies from result to result. A confirmation must not
+            begin again because the newest allowance is larger. Default: the newest result.
         """
         sigmas_measured = newest.sigmas_measured
         allowance = newest.allowance
@@ -278,7 +279,7 @@ class Goal:
         return ratios
 
     def _update_best(self, newest: Calibration, ratios: FloatArray) -> None:
-        """Make the newest result the best result if it reaches the goal and is not clearly worse.
+        """Store the newest result as the best one if it reaches the goal and is not clearly worse.
 
         Parameters
         ----------
@@ -294,7 +295,7 @@ class Goal:
             return
         if self.best is None and self._confirmation_s(newest) > 0.0:
             return
-        # Axes that motion cannot improve do not count.
+        # Ignore axes that motion cannot improve.
         ratio = float(
             (newest.sigmas / self._targets)[ratios > 0.0].max(initial=0.0)
         )
@@ -305,7 +306,7 @@ class Goal:
     def _confirmation_s(self, newest: Calibration) -> float:
         """Return the further motion (s) that confirms the newest result; 0 if it is confirmed."""
         motion_s = self._results[-1].motion_s
-        # Motion (s) of the first result in the latest run of results within the targets.
+        # Motion (s) at the first result of the current sequence of results within the targets.
         first_s = motion_s
         for result in reversed(self._results):
             is_within = self._variance_ratios(newest, result).max() <= 1.0
@@ -317,13 +318,13 @@ class Goal:
     def _time_left(self, newest: Calibration, ratios: FloatArray) -> FloatArray:
         """Return the times (6,) of further motion (s) until each axis is within its target.
 
-        The information of an axis is the inverse of its variance. It is assumed to grow at the
-        average rate of the session, or at the highest rate since one of the last results, because
-        the motion may have improved. A time is infinite as long as the motion is too short for an
-        estimate.
+        The information on an axis is the inverse of its variance. It is assumed to grow at the
+        average rate of the session. If the rate since one of the last results is higher, this rate
+        is used, because the motion may have improved. The time is infinite if the motion is too
+        short for an estimate.
         """
         motion_s = self._results[-1].motion_s
-        # Information, as a share of what the target needs.
+        # Information as a share of the information that the target requires.
         share = 1.0 / np.maximum(ratios, 1.0)
         rate = np.zeros(6)
         if motion_s >= _MIN_CONFIRMATION_S:
@@ -364,7 +365,7 @@ class Goal:
             total_s = max(self._confirmation_s(newest), self._period_s)
             step = np.searchsorted(_CONFIRMING_STEPS_S[:-1], 0.99 * total_s)
             total_s = float(_CONFIRMING_STEPS_S[step])
-            # Forget the last reported total, which was estimated.
+            # The last reported total was an estimate. Do not compare the new value with it.
             self._steps[-1] = len(_STEPS_S) - 1
         axes = self._by_axis(newest.sigmas, axes_left_s)
         left_text = duration(total_s).replace(".0 ", " ")
@@ -390,8 +391,8 @@ class Goal:
     ) -> Progress:
         """Return the progress with its limiting axis, and with the motion that helps this axis.
 
-        The limiting axis is the one farthest from its target. An axis whose allowance exceeds its
-        target is chosen only if all other axes are within their targets.
+        The limiting axis is farthest from its target. An axis whose allowance exceeds its target is
+        limiting only if all other axes are within their targets.
         """
         is_out_of_reach = newest.allowance >= self._targets
         reachable = np.where(is_out_of_reach, 0.0, ratios)
@@ -420,7 +421,7 @@ class Goal:
                 motion = "This motion is right, more of it"
             elif _turns_about(newest_motion, axis):
                 # A rotation about an axis does not observe this axis. The motion must change, so
-                # the time left at the present motion is no forecast.
+                # the time left with the present motion is no forecast.
                 row = replace(row, seconds_left=np.inf)
                 axes = {**progress.axes, AXIS_KEYS[axis]: row}
                 progress = replace(progress, seconds_left=np.inf, axes=axes)
@@ -453,12 +454,12 @@ class Goal:
     def _in_steps(self, left_s: FloatArray) -> list[float]:
         """Round times left (7,), of six axes and in all, to steps that decrease slowly.
 
-        Estimates of the time left jump from result to result. So the reported time increases only
-        if the new time is longer by several steps, unknown, or follows an unknown time.
+        Estimates of the time left jump from result to result. Therefore the reported time increases
+        only if the new value is longer by several steps, is unknown, or follows an unknown value.
         """
         before = self._steps
         infinite = len(_STEPS_S) - 1
-        # 5 % tolerance: a time slightly above a step is rounded down to it.
+        # The tolerance is 5 %: a time slightly above a step is rounded down to it.
         steps = np.searchsorted(_STEPS_S, 0.95 * left_s)
         has_infinite = (before == infinite) | (steps == infinite)
         is_new = (
@@ -466,7 +467,7 @@ class Goal:
             | (steps == 0)
             | (steps >= before + _MIN_INCREASE_STEPS)
         )
-        # If an axis leaves its target again, its time rises to the smallest step only.
+        # If an axis leaves its target again, its time increases to the smallest step only.
         slower = np.clip(
             steps, before - _MAX_DECREASE_STEPS, np.maximum(before, 1)
         )
@@ -494,9 +495,9 @@ class Goal:
         }
 
     def _reason_to_stop(self, newest: Calibration) -> str:
-        """Return why the session cannot continue like this; empty if streams and result are fine.
+        """Return the reason to stop; empty if the streams and the result are sound.
 
-        With faulty streams, the person must stop. After a failed solve, the session waits.
+        If the streams are faulty, the person must stop. After a failed solve, the session waits.
         """
         if self._faults:
             return f"Stop: the streams are faulty: {self._faults[0]}."
@@ -508,8 +509,8 @@ class Goal:
 def _own_faults(calibration: Calibration) -> list[str]:
     """Return the findings that make a result unusable, one sentence each.
 
-    They are needed for positions, rotations and rates. For poses, the caller of :meth:`Goal.add`
-    passes the findings of the stream checks.
+    For positions, rotations and rates, the findings are in the result. For poses, the caller of
+    :meth:`Goal.add` passes the findings of the stream checks.
     """
     return [
         reason.sentence
@@ -519,15 +520,15 @@ def _own_faults(calibration: Calibration) -> list[str]:
 
 
 def _confirming_motion(motion_s: float) -> float:
-    """Return the motion (s) that confirms a first result within the targets at ``motion_s``."""
+    """Return the motion (s) that confirms a first result within the targets after ``motion_s``."""
     return min(max(motion_s, _MIN_CONFIRMATION_S), _MAX_CONFIRMATION_S)
 
 
 def _is_helpful(motion: Excitation, axis: str) -> bool:
-    """Whether the motion has a rotation that observes an axis and that a flat drive lacks.
+    """Return whether the motion observes an axis by a rotation that a flat drive lacks.
 
-    Rotations about the two other axes observe it. The axis with the most rotation does not count,
-    because every drive has this rotation.
+    The rotations about the two other axes observe an axis. The axis with the most rotation is left
+    out, because every drive has this rotation.
     """
     main = int(np.argmax(motion.rotation))
     index = AXES.index(axis) % 3
@@ -536,7 +537,7 @@ def _is_helpful(motion: Excitation, axis: str) -> bool:
 
 
 def _turns_about(motion: Excitation, axis: str) -> bool:
-    """Whether most rotation of the motion is about an axis, such as z for a vehicle."""
+    """Return whether most rotation of the motion is about an axis, such as z for a vehicle."""
     return int(np.argmax(motion.rotation)) == AXES.index(axis) % 3
 
 
@@ -554,7 +555,7 @@ def _done_in_words(best: Calibration, precision: str) -> str:
 
 
 def _not_yet_in_words(limiting: str, ratios: FloatArray) -> str:
-    """Return that an axis is not determined, with all others that have no result at all."""
+    """Return the sentence that an axis is not determined, and all other axes without a result."""
     axes = [limiting]
     if np.isinf(ratios[AXES.index(limiting)]):
         axes = [

@@ -1,9 +1,9 @@
-"""One input of the session: counts its messages, checks their stamps and passes their poses on.
+"""An input of the session: it counts messages, checks their stamps and passes poses on.
 
 A message whose stamp is near the last stamps is accepted at once. Any other message is held back.
-Six messages that are held in sequence are a real change: a gap, a bag that loops, or a clock that
-was reset. If the stream goes on as before after fewer messages, the stamps of the held messages
-were corrupt, and these messages are dropped.
+If six messages are held in sequence, the change of their stamps is real: a gap, a bag that loops,
+or a clock that was reset. If the stream continues as before after fewer messages, the held messages
+had corrupt stamps and are dropped.
 """
 
 import itertools
@@ -35,35 +35,37 @@ from hand_eye_calib.online.live.state import (
     Level,
 )
 
-# Largest share of lost messages that needs no action of a person.
+# A smaller share of lost messages needs no action.
 _MAX_LOST_SHARE = 0.01
-# Share of repeated stamps above which the publisher does not set its stamps.
+# Above this share of repeated stamps, the publisher does not set its stamps.
 _MAX_REPEATED_SHARE = 0.5
 # Fewest messages from which a share of repeated stamps is computed.
 _MIN_MESSAGES = 20
-# Fewest turns of the publishers of a topic after which their poses are mixed in the session.
+# If several publishers of a topic alternate at least this number of times, their poses are mixed in
+# the session.
 _MIN_TURNS = 10
 
-# Reports, one a second, of a rate or share. A bad message is reported for as many seconds.
+# Number of reports, one per second, over which a rate or a share is computed. A bad message is
+# reported for as many seconds.
 _REPORTS = 10
-# Fewest messages, held in sequence, whose stamps are taken for a real change. Corrupt stamps come
-# in shorter sequences.
+# If at least this number of messages is held in sequence, the change of their stamps is real.
+# Corrupt stamps come in shorter sequences.
 MIN_HELD = 6
-# Largest difference (ns) of stamps that are near each other. A larger jump back begins a new
+# Largest difference (ns) between stamps that are near each other. A larger jump back begins a new
 # session.
 NEAR_NS = 1_000_000_000
-# Stamps are also near each other within this many periods of their stream. A stream that pauses for
-# longer is reported as paused.
+# Stamps are also near each other if they differ by at most this number of periods of the stream. A
+# longer pause is reported.
 _PERIODS = 5
 # Longest interval (ns) between two messages that are held in sequence.
 _MAX_PAUSE_NS = 60_000_000_000
 
-# A gap between stamps is a step of the clock if it is longer than the time in which it arrived, by
+# A gap between stamps is a step of the clock if it is longer than the time between the messages by
 # this factor.
 _STEP_RATIO = 2.0
 
-# Time (s) without a message after which a stream is silent. After one stream has jumped back, old
-# messages of the other streams are dropped for the same time.
+# A stream is silent after this time (s) without a message. If a stream jumps back, old messages of
+# the other streams are dropped for the same time.
 SILENT_AFTER_S = 2.0
 # Time (s) without a pose after which a session is paused.
 PAUSED_AFTER_S = 5.0
@@ -75,18 +77,18 @@ Stamped: TypeAlias = tuple[int, Any]
 
 
 class Judgement(NamedTuple):
-    """Decision of a :class:`StampGuard` about a message and about the messages it holds.
+    """Decision of a :class:`StampGuard` about a message and about the held messages.
 
     Attributes
     ----------
     taken : sequence of (int, message)
         Stamps and messages to use now: the message, or all messages that were held.
     dropped : sequence of int
-        Corrupt stamps of held messages that are dropped.
+        Corrupt stamps of held messages. These messages are dropped.
     jumped_back : bool
-        Whether the messages to use are the first of a new session.
+        Whether the messages begin a new session.
     repeated : sequence of int
-        The message's stamp, if it repeats the stamp of the last held message.
+        The stamp of the message, if the last held message has the same stamp.
     """
 
     taken: Sequence[Stamped] = ()
@@ -96,7 +98,7 @@ class Judgement(NamedTuple):
 
 
 class StampGuard:
-    """Checks the stamps of one stream, and holds messages until their stamps are confirmed.
+    """Check the stamps of a stream, and hold messages back until their stamps are confirmed.
 
     Attributes
     ----------
@@ -108,11 +110,11 @@ class StampGuard:
         self._reset()
 
     def _reset(self) -> None:
-        # Until this time (steady, s), messages are older than the session.
+        # Until this steady time (s), messages are from before the session.
         self._outdated_until_s = -math.inf
         self.last_ns: int | None = None
-        # The last accepted stamps. At most MIN_HELD - 1 corrupt stamps come in sequence, so the
-        # median of these stamps is a correct one.
+        # The last accepted stamps. At most MIN_HELD - 1 corrupt stamps follow each other, so the
+        # median of these stamps is correct.
         self._recent_ns: deque[int] = deque(maxlen=2 * MIN_HELD - 1)
         self._held: list[Stamped] = []
 
@@ -145,8 +147,8 @@ class StampGuard:
         Parameters
         ----------
         now_s : float, optional
-            Steady time (s), if the session begins because another stream has jumped back. This
-            stream's messages from before the jump are then dropped for some seconds.
+            Steady time (s), if another stream has jumped back and begins the session. For some
+            seconds, messages of this stream are from before the jump, and are dropped.
         """
         if now_s is None:
             self._reset()
@@ -192,14 +194,14 @@ class StampGuard:
         return dropped
 
     def _accept_held(self, now_s: float) -> Judgement:
-        """Accept the held messages: the change of their stamps is real."""
+        """Accept the held messages, because the change of their stamps is real."""
         messages = self._held
         self._held = []
         first_ns = messages[0][0]
         before_ns = statistics.median_low(self._recent_ns or [first_ns])
         is_back = first_ns < before_ns - NEAR_NS
-        # Another stream may have jumped back shortly before, so that the new session has begun
-        # already. Then only this guard is reset.
+        # Another stream may have jumped back shortly before. The new session has then begun
+        # already, and only this guard is reset.
         has_begun = now_s < self._outdated_until_s
         self._outdated_until_s = -math.inf
         if is_back:
@@ -210,7 +212,7 @@ class StampGuard:
 
 
 class _Counts(NamedTuple):
-    """Messages of an input up to a steady time ``at_s``; ``null`` ones have no pose."""
+    """Numbers of messages until a steady time ``at_s``; ``null`` counts those without a pose."""
 
     at_s: float
     arrived: int
@@ -219,7 +221,7 @@ class _Counts(NamedTuple):
 
 
 class PoseInput:
-    """Passes the poses of one sensor on to the session.
+    """Pass the poses of a sensor on to the session.
 
     Parameters
     ----------
@@ -230,14 +232,15 @@ class PoseInput:
     session : LiveSession
     log : NodeLog
     on_jump_back : callable
-        Called with this input when its stamps have jumped back, to begin a new session.
+        Function that is called with this input after its stamps have jumped back. It begins a new
+        session.
 
     Attributes
     ----------
     is_enabled : bool
         Whether poses are accepted.
     problem : str
-        Reason why there are no poses; empty if unknown.
+        Reason for missing poses; empty if unknown.
     publishers : tuple of str or None
         Name of the node of each publisher of the topic; None for transforms.
     """
@@ -258,7 +261,7 @@ class PoseInput:
         self._session = session
         self._log = log
         self._on_jump_back = on_jump_back
-        # What the stream measures, by the options: "auto" or one of registry.MEASURES.
+        # Measured quantity according to the options: "auto", or an entry of registry.MEASURES.
         self._wanted = "auto"
         self._guard = StampGuard()
         self._refused = Counter[str]()
@@ -291,16 +294,16 @@ class PoseInput:
         Parameters
         ----------
         because_of : PoseInput, optional
-            The input whose stamps have jumped back; None if a person has asked for a new session.
+            Input whose stamps have jumped back; None if a person requested the new session.
         """
         self._sensor_frame = ""
         self._world_frame = ""
         self._longest_gap_ns = 0
-        # Number of the last message while the topic had several publishers, and how often a number
-        # was below the number before it.
+        # Sequence number of the last message while the topic had several publishers.
         self._mixed_number: int | None = None
+        # Number of times that a sequence number was below the previous one.
         self._n_turns = 0
-        # Names of the publishers whose poses are mixed in this session.
+        # Names of the publishers whose poses are mixed in the session.
         self._mixed: tuple[str, ...] = ()
         # Time (steady, s) of the last pose.
         self._taken_s: float | None = None
@@ -324,25 +327,26 @@ class PoseInput:
         Parameters
         ----------
         sequence_number : int or None
-            Number of the message by its publisher. None if lost messages cannot be counted: the
-            topic has several publishers, or the middleware has no numbers.
+            Sequence number that the publisher gave to the message. None if lost messages cannot be
+            counted: the topic has several publishers, or the middleware has no numbers.
         """
         expected = self._next_number
         self._next_number = (
             None if sequence_number is None else sequence_number + 1
         )
         if expected is not None and sequence_number is not None:
-            # Numbers that fall begin anew: the publisher was started again, or there is a second
-            # publisher that is not discovered yet. Then the next rise is the turn of the first.
+            # Smaller numbers have two causes. The publisher was restarted, or there is a second
+            # publisher that is not discovered yet. In the second case, the next increase is a
+            # message of the first publisher.
             has_fallen = sequence_number < expected
             if not (has_fallen or self._has_fallen):
                 self._lost += sequence_number - expected
             self._has_fallen = has_fallen
 
     def count_mixed(self, sequence_number: int) -> None:
-        """Count the turns of the publishers of a topic that has several.
+        """Count how often the publishers of a topic alternate.
 
-        A publisher that was started again also takes a turn, but a single one.
+        A restarted publisher also counts, but only once.
         """
         last = self._mixed_number
         self._mixed_number = sequence_number
@@ -351,7 +355,7 @@ class PoseInput:
             self._mixed = tuple(sorted(self.publishers or ()))
 
     def accept(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
-        """Process a message; ``read`` is called once its stamp is accepted."""
+        """Process a message. ``read`` is called after its stamp was accepted."""
         now_s = time.monotonic()
         self._arrived += 1
         self._arrived_s = now_s
@@ -382,7 +386,7 @@ class PoseInput:
             self._log.info(f"first pose on {self.topic}, stamp {first_s:.3f} s")
 
     def _take_gap(self, gap_ns: int, now_s: float) -> None:
-        """Store the gap (ns) before an accepted stamp, and report it if the clock has stepped."""
+        """Store the gap (ns) before an accepted stamp. Report it if the clock has stepped."""
         self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
         gap_s = gap_ns * 1e-9
         silent_s = self.silent_s(now_s)
@@ -415,7 +419,7 @@ class PoseInput:
         self._log.debug(f"{self.topic}: message {message} refused: {text}")
 
     def leave_out(self, message: str, reason: NoPoseError) -> None:
-        """Count a message that has no pose on purpose, such as that of a tracker that is lost."""
+        """Count a message that has no pose on purpose, such as that of a tracker without track."""
         self._refused["no pose"] += 1
         self._log.debug(
             f"{self.topic}: message {message} is left out: {reason}"
@@ -430,7 +434,7 @@ class PoseInput:
         )
 
     def _take(self, stamp_ns: int, read: Callable[[], PoseFields]) -> None:
-        """Read a message and add its pose to the session, or count it as refused."""
+        """Read a message, and add its pose to the session or count it as refused."""
         try:
             pose = read()
             self._check_frames(pose)
@@ -452,18 +456,18 @@ class PoseInput:
     def _check_frames(self, pose: PoseFields) -> None:
         """Pass changed names of frames on to the engines.
 
-        A message type without a sensor frame has None. Its frame then has the name from a parameter
-        or the default.
+        A message type without a sensor frame has None. The name is then from a parameter, or the
+        default.
 
         Raises
         ------
         HandEyeCalibError
-            If the engines refuse a name, such as that of another sensor.
+            If the engines refuse a name, for example because another sensor has it.
         """
         sensor = pose.sensor_frame
         has_new_sensor = sensor is not None and sensor != self._sensor_frame
         has_new_world = pose.world_frame != self._world_frame
-        # The frames of a message without a pose have no meaning.
+        # Ignore the frames of a message without a pose.
         if has_new_sensor or has_new_world:
             check_not_null(*pose.position, *pose.quat_xyzw)
         if sensor is not None and has_new_sensor:
@@ -476,7 +480,7 @@ class PoseInput:
     # ----------------------------------------------------------------- state
 
     def is_silent(self, steady_s: float) -> bool:
-        """Whether messages have arrived, but arrive no longer."""
+        """Return whether messages have arrived, but no longer arrive."""
         return (
             self._arrived_s is not None
             and steady_s - self._arrived_s > SILENT_AFTER_S
@@ -487,7 +491,7 @@ class PoseInput:
         return None if self._taken_s is None else steady_s - self._taken_s
 
     def is_paused(self, steady_s: float) -> bool:
-        """Whether poses have arrived in this session, but arrive no longer."""
+        """Return whether poses have arrived in this session, but no longer arrive."""
         silent_s = self.silent_s(steady_s)
         if silent_s is None or not self.is_enabled:
             return False
@@ -496,14 +500,14 @@ class PoseInput:
         )
 
     def state(self, steady_s: float, may_rest: bool) -> InputState:
-        """Return the diagnostics. This method must be called at least once a second.
+        """Return the diagnostics. Call this method at least once a second.
 
         Parameters
         ----------
         steady_s : float
             Steady time (s).
         may_rest : bool
-            Whether silence is normal: there is a result, and the other input is silent too.
+            Whether silence is normal: a result exists, and the other input is silent, too.
         """
         now = _Counts(
             steady_s, self._arrived, self._lost, self._refused["no pose"]
@@ -572,7 +576,7 @@ class PoseInput:
     def _condition(
         self, steady_s: float, rate_hz: float, lost_share: float, may_rest: bool
     ) -> InputCondition:
-        """Return the gravest condition of the input."""
+        """Return the gravest condition of the input with its text."""
         if self._arrived_s is None:
             text = f"no message on {self.topic} yet"
             text = f"{text}: {self.problem}" if self.problem else text
@@ -605,7 +609,7 @@ class PoseInput:
         )
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
-        """Return why poses no longer arrive; empty if they arrive, or if the reason is unknown."""
+        """Return the reason why poses no longer arrive; empty if they arrive or it is unknown."""
         if self._taken_s is not None and not self.is_paused(steady_s):
             return ""
         silent_s = steady_s - arrived_s
@@ -634,5 +638,5 @@ def repeated_stamps(stamp_ns: int) -> str:
 
 
 def with_stamp(stamp_ns: int) -> str:
-    """Return the name by which the log refers to a message."""
+    """Return the name of a message in the log."""
     return f"with stamp {stamp_ns * 1e-9:.9f} s"

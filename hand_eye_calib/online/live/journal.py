@@ -1,6 +1,6 @@
-"""The journal of the live session: its poses on disk, so that a crash does not lose them.
+"""Journal of the live session: the poses on disk, so that a crash does not lose them.
 
-A thread of its own writes the journal, so that a slow or full disk never delays a message.
+A separate thread writes the journal, so that a slow or full disk never delays a message.
 """
 
 import fcntl
@@ -19,7 +19,7 @@ from hand_eye_calib.online.live.log import NodeLog
 # Period (s) at which poses are written to the disk. A crash loses the poses of one period.
 FLUSH_PERIOD_S = 0.25
 
-# The disk counts as dead if this number of jobs waits in the queue: one minute of batches.
+# The disk counts as dead if this number of jobs waits in the queue. It is one minute of batches.
 _MAX_WAITING = 240
 
 # Stream, stamp (ns), position (m) and quaternion (x, y, z, w).
@@ -60,7 +60,7 @@ def lock_directory(directory: Path) -> int | None:
 
 
 class SessionJournal:
-    """Journal that receives poses in the thread of the executor and writes them in its own thread.
+    """Receive poses in the thread of the executor, and write them to disk in another thread.
 
     The first failure to write ends the journal until the next session.
 
@@ -68,16 +68,17 @@ class SessionJournal:
     ----------
     directory : path
     about : callable
-        Returns topic, options, frames and origin of each stream, which the journal stores, too.
+        Function that returns topic, options, frames and origin of each stream. The journal stores
+        them.
     log : NodeLog
     resumed : Journal, optional
-        The session in the directory, to continue it. By default the session there is kept aside,
-        and a new one begins.
+        Session in the directory that is continued. By default it is kept aside, and a new session
+        begins.
 
     Attributes
     ----------
     poses : list
-        Poses that are not written yet; the caller appends new poses.
+        Poses that were not written yet. The caller appends new poses.
     error : str
         Reason why the journal cannot be written; empty otherwise.
 
@@ -101,7 +102,7 @@ class SessionJournal:
         self._about = about
         self.poses: list[_Pose] = []
         self._jobs: queue.Queue[Callable[[], None] | None] = queue.Queue()
-        # Used by the thread only; None while the journal cannot be written.
+        # Only the thread uses the writer. It is None while the journal cannot be written.
         self._writer: journal.JournalWriter | None = None
         self._jobs.put(partial(self._open, about(), resumed))
         self._thread = threading.Thread(
@@ -110,7 +111,7 @@ class SessionJournal:
         self._thread.start()
 
     def flush(self) -> None:
-        """Pass new poses on to the thread. This method must be called often."""
+        """Pass new poses on to the thread. Call this method often."""
         poses = self.poses
         self.poses = []
         if self._jobs.qsize() > _MAX_WAITING and not self.error:
@@ -149,7 +150,7 @@ class SessionJournal:
         while (job := self._jobs.get()) is not None:
             try:
                 job()
-            # Even a defect of the program must not end the node, only the journal.
+            # A defect of the program must end the journal only, not the node.
             except Exception as error:
                 self._writer = None
                 reason = (
@@ -160,7 +161,7 @@ class SessionJournal:
     def _open(
         self, about: journal.About, resumed: journal.Journal | None = None
     ) -> None:
-        """Start to write; a session in the directory is kept aside, unless it is continued."""
+        """Start to write. A session in the directory is kept aside, unless it is continued."""
         if resumed is None and journal.is_used(self.directory):
             n_poses = journal.count_poses(self.directory)
             # A journal without poses is overwritten.

@@ -1,4 +1,4 @@
-"""The log of the node: lines that differ only in their numbers are written once."""
+"""Log of the node. Lines that differ only in their numbers are written once."""
 
 import re
 import time
@@ -6,21 +6,21 @@ from typing import Any
 
 from hand_eye_calib.core.base.errors import printable
 
-# Time (s) within which a warning or an error is not written again, unless a new session begins.
+# A warning or an error is not repeated within this time (s), unless a new session begins.
 ONCE_S = 1800.0
 
-# Time (s) within which news that come again and again, such as a better result, are not repeated.
+# News that come repeatedly, such as a better result, are not repeated within this time (s).
 GOES_ON_S = 60.0
 
 _NUMBERS = re.compile(r"[\d.,+-]+")
 
 
 class NodeLog:
-    """Log that does not repeat a text within a time.
+    """Log that does not repeat a text within a certain time.
 
-    The throttle of a ROS logger works by line of code, so it would mix the warnings of two topics.
-    Here, texts that differ only in their numbers count as the same text, and so do all texts with
-    the same ``key``. ``every_s`` is the time (s) within which a text is not repeated.
+    The throttle of a ROS logger belongs to a line of code, so it would mix the warnings of two
+    topics. Here, texts that differ only in their numbers count as equal. All texts with the same
+    ``key`` also count as equal. A text is not repeated within ``every_s`` (s).
     """
 
     def __init__(self, logger: Any) -> None:
@@ -31,7 +31,8 @@ class NodeLog:
         """Begin a new session, in which every text may be written again."""
         self._written_at_s.clear()
 
-    # rclpy ties a line of code to one severity, so every method calls the logger itself.
+    # rclpy accepts only one severity per line of code. Therefore each method calls the logger
+    # itself.
     def debug(self, text: str) -> None:
         """Write a detail that helps to find a fault."""
         self._logger.debug(_escaped(text))
@@ -58,7 +59,7 @@ class NodeLog:
         key = _NUMBERS.sub("", text)
         now_s = time.monotonic()
         is_due = now_s - self._written_at_s.get(key, -float("inf")) >= every_s
-        # Bound the memory: a sound session has far fewer different texts.
+        # Limit the memory. A sound session has far fewer different texts.
         if is_due and len(self._written_at_s) < 10_000:
             self._written_at_s[key] = now_s
         return is_due

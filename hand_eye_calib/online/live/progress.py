@@ -24,8 +24,8 @@ class AxisProgress:
     target : float
         Target of the standard deviation (m or rad).
     seconds_left : float
-        Time until the target is reached if the motion goes on like this (s); infinite if the motion
-        does not observe the axis.
+        Time (s) until the target is reached if the motion continues like this. Infinite if the
+        motion does not observe the axis.
     """
 
     sigma: float
@@ -40,12 +40,12 @@ class Progress:
     Attributes
     ----------
     sentence : str
-        What the person who moves the robot should do next.
+        Next action of the person who moves the robot.
     done : bool
         Whether the goal is reached.
     seconds_left : float
-        Time until the goal is reached if the motion goes on like this (s), in coarse steps;
-        infinite if unknown.
+        Time (s) until the goal is reached if the motion continues like this, in coarse steps.
+        Infinite if unknown.
     precision : str
         Precision of the best result, in words; empty before the goal is reached.
     is_faulty : bool

@@ -9,7 +9,7 @@ from hand_eye_calib.online.live.solving import Failure
 
 
 class ResultLog:
-    """Logs results and failures of a session, and returns them as text."""
+    """Log the results and failures of a session, and return them as text."""
 
     def __init__(self, log: NodeLog) -> None:
         self._log = log
@@ -17,7 +17,7 @@ class ResultLog:
 
     def restart(self) -> None:
         """Begin a new session."""
-        # Sentences of the reasons for a verdict that were logged as warnings, by their rules.
+        # Reasons for a verdict that were logged as warnings: their sentences, by rule.
         self._warned: dict[str, str] = {}
 
     def result(
@@ -26,10 +26,10 @@ class ResultLog:
         progress: Progress,
         every_s: float = GOES_ON_S,
     ) -> str:
-        """Return a line about a calibration with its reasons and warnings; log what is new.
+        """Return a line about a calibration, with reasons and warnings. Log what is new.
 
-        As long as more motion helps, the progress names what to do. So the reasons for the verdict
-        are logged only if more motion does not help.
+        While more motion helps, the progress names the next action. Therefore the reasons for the
+        verdict are logged only if more motion does not help.
 
         Parameters
         ----------
@@ -49,7 +49,7 @@ class ResultLog:
         for reason in calibration.reasons:
             text = f"{reason.sentence}; {reason.advice_on(Interface.NODE)}"
             texts.append(text)
-            # The stream checks have logged the findings.
+            # The stream checks have already logged the findings.
             if is_final and not reason.is_finding:
                 self._log.warning(f"{reason.verdict.value}: {text}")
                 self._warned[reason.rule] = reason.sentence

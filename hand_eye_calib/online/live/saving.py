@@ -1,4 +1,4 @@
-"""Save the session's result: data files at once, report and rig in a process of their own."""
+"""Save the result of the session: data files at once, report and rig in a separate process."""
 
 import pickle
 import subprocess
@@ -24,11 +24,11 @@ _PAGES = "from hand_eye_calib.online.live.pages import write_session; write_sess
 
 
 class Saver:
-    """Saves the result of the session.
+    """Save the result of the session.
 
-    Before the first save into a directory, files of an earlier session are kept aside. The process
-    that writes report and rig may run longer than the node. A newer save kills this process,
-    because only the newest result counts.
+    Before the first save into a directory, the files of an earlier session are kept aside. The
+    process for report and rig may run longer than the node. A newer save kills this process,
+    because only the newest result is of use.
 
     Attributes
     ----------
@@ -43,12 +43,12 @@ class Saver:
         self._session = session
         self._cycle = cycle
         self._log = log
-        # Directory in which earlier results are kept aside already.
+        # Directory whose earlier results are already kept aside.
         self._earlier_kept_in = ""
         self._process: subprocess.Popen[bytes] | None = None
 
     def save(self, options: NodeConfig) -> Outcome:
-        """Write the result files; return the success and a line of text, which is also logged."""
+        """Write the result files. Return the success, and a line of text that is also logged."""
         try:
             text = self._save(options)
         except (OSError, HandEyeCalibError) as error:
@@ -59,7 +59,7 @@ class Saver:
         return True, text
 
     def _save(self, options: NodeConfig) -> str:
-        """Write the result files, start the process for the pages, and return the line of text.
+        """Write the result files, start the process for the pages, and return a line of text.
 
         Raises
         ------
@@ -81,13 +81,13 @@ class Saver:
             raise NotEnoughDataError("there is no result yet")
         result = result.with_part("goal", self._cycle.goal.progress)
         inputs = self._session.calibrator.inputs(self._session.topics)
-        # The options of the result, which contain those that a check has set.
+        # Options of the result, including those that a check has set.
         inputs["options"] = snapshot.config.to_options()
         path = output_path(directory)
         if self._earlier_kept_in != directory:
             keep_earlier_results(path)
         self._earlier_kept_in = directory
-        # End the process of an earlier save, which writes files of an older result.
+        # Kill the process of an earlier save, because it writes an older result.
         if self._process is not None:
             self._process.kill()
             self._process.wait()
@@ -120,10 +120,10 @@ class Saver:
     def _write_pages(
         self, directory: str, session: SessionResult, files: str
     ) -> str:
-        """Start the process that writes report and rig; return a sentence about the files.
+        """Start the process for report and rig. Return a sentence about its files.
 
-        The start takes milliseconds. The process reads the result from a file without a name. No
-        other program can change this file, and the node can end without waiting for a pipe.
+        The start takes milliseconds. The process reads the result from an unnamed file. No other
+        program can change this file, and the node can end without waiting for a pipe.
         """
         self._process = None
         try:

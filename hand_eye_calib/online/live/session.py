@@ -45,8 +45,8 @@ class LiveSession:
     engines : dict of str to Calibrator
         Engine of each child sensor with the parent: "child", and the further child sensors.
     number : int
-        Number of the session, which grows with every new session. A solve that was started in
-        another session is out of date.
+        Number of the session. It increases with every new session, so that the solve of another
+        session is recognised as out of date.
     topics : dict of str to str
         Topic of each stream, for the journal.
     journal : SessionJournal or None
@@ -64,7 +64,7 @@ class LiveSession:
         self.topics: dict[str, str] = {}
         self.journal: SessionJournal | None = None
         self._log = log
-        # False for the monitor of the mount, which takes the pairs and needs no solve.
+        # False for the monitor of the mount, which uses the pairs without a solve.
         self._is_solved = True
         # Number of poses of the last solve.
         self._n_solved = 0
@@ -80,7 +80,7 @@ class LiveSession:
 
     @property
     def has_new_poses(self) -> bool:
-        """Whether there are poses or options that no solve has used."""
+        """Whether there are poses or options that were not part of a solve."""
         return self._is_solved and self._n_poses() > self._n_solved
 
     def copy_to_solve(self) -> Calibrator:
@@ -89,12 +89,12 @@ class LiveSession:
         return deepcopy(self.calibrator)
 
     def watch_only(self, limits: BufferLimits | None) -> None:
-        """Never solve, and store few poses. The caller takes the pairs as soon as they are made.
+        """Switch solves off, and store few poses only. The caller takes the pairs at once.
 
         Parameters
         ----------
         limits : BufferLimits or None
-            Limits of the buffers; None to calibrate again.
+            Limits of the buffers. None switches solves on again.
         """
         self._is_solved = limits is None
         engine = Calibrator(self.calibrator.config, limits or BufferLimits())
@@ -102,7 +102,7 @@ class LiveSession:
         self._n_solved = 0
 
     def set_measures(self, stream: str, measures: str) -> None:
-        """Set what a stream measures. Its message type has determined that.
+        """Set the measured quantity of a stream, according to its message type.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class LiveSession:
         Raises
         ------
         ConfigError
-            If the session cannot use such a stream, or cannot use it with the other stream.
+            If the session cannot use such a stream, alone or with the other stream.
         """
         is_pair = stream in STREAMS
         if measures != "poses" and not (is_pair and self._is_solved):
@@ -132,12 +132,12 @@ class LiveSession:
     def origin(self, stream: str) -> LocalOrigin:
         """Return the local origin of a stream's latitudes and longitudes.
 
-        A resumed session has the origin of its journal; otherwise the first position becomes it.
+        A resumed session has the origin in its journal. Otherwise the first position is the origin.
         """
         return self._origins.setdefault(stream, LocalOrigin())
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Apply changed options; the poses stay and will be solved again."""
+        """Apply changed options. The poses stay, and will be solved again."""
         for name, engine in self.engines.items():
             if name != "child":
                 engine.reconfigure(_for_other_child(config))
@@ -145,7 +145,7 @@ class LiveSession:
         self._n_solved = 0
 
     def reset(self) -> None:
-        """Drop all poses and begin a new session; the journal of the old session is kept aside."""
+        """Drop all poses and begin a new session. The journal of the old session is kept aside."""
         for engine in self.engines.values():
             engine.reset()
         self.number += 1
@@ -196,7 +196,7 @@ class LiveSession:
             )
 
     def flush_journal(self) -> None:
-        """Write new poses to the disk. This method must be called often."""
+        """Write new poses to the disk. Call this method often."""
         if self.journal is not None:
             self.journal.flush()
 
@@ -274,7 +274,7 @@ class LiveSession:
 
 
 def _for_other_child(config: CalibratorConfig) -> CalibratorConfig:
-    """Return the options for a further child sensor: without the values of the first child."""
+    """Return the options for a further child sensor, without the values for the first child."""
     names = {
         item.name
         for item in fields(config)
@@ -293,8 +293,8 @@ def output_path(directory: str, base: Path | None = None) -> Path:
     Raises
     ------
     ConfigError
-        If the user of ``~`` is unknown, or if the path is neither ``base`` nor below it. While the
-        node runs, any program may set its parameters, so writing is limited to ``base``.
+        If the user of ``~`` is unknown, or if the path is neither ``base`` nor below it. Any
+        program may set parameters of the running node, so the node writes to ``base`` only.
     """
     try:
         path = Path(directory).expanduser()

@@ -1,8 +1,8 @@
-"""The solving process of the node: its jobs, its answers, and both ends of its pipes.
+"""Solving process of the node: its jobs, its answers, and both ends of its pipes.
 
-A solve in a thread would share the interpreter with the callbacks of the node: on a slow machine,
-their latency rises to a second. The process imports the engine and nothing of ROS. Jobs and answers
-are pickles. Pickles are safe here, because both ends of a pipe are this program, and no other
+A solve in a thread would share the interpreter with the callbacks of the node. On a slow machine,
+their latency would rise to a second. The process imports the engine, but nothing of ROS. Jobs and
+answers are pickles. This is safe, because both ends of a pipe are this program, and no other
 program can write into the pipe.
 """
 
@@ -46,21 +46,22 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.state import GRACE_S
 from hand_eye_calib.online.live.stream_checks import merged
 
-# Code of the process. With `python -m`, the classes of its answers would belong to the module
-# __main__, and the node could not unpickle them.
+# Code that the process runs. With `python -m`, the classes of its answers would belong to the
+# module __main__, and the node could not unpickle them.
 _SOLVE = "from hand_eye_calib.online.live.solving import main; main()"
 
 # Time (s) after which a job counts as hung: live sessions are solved in seconds.
 HANGS_AFTER_S = 600.0
 
-# Length (ns) of the newest part of the session. Advice about the motion refers to this part.
+# Duration (ns) of the newest part of the session, to which advice about the motion refers.
 _NEWEST_NS = 60_000_000_000
 
-# Priority of a job without hurry, relative to that of the node: its callbacks come first. At
-# 2 x 400 Hz, the latency p99 of the callbacks was 5 ms, and 14 ms without a lower priority.
+# Nice value of a job that is not urgent, relative to the node: the callbacks of the node are more
+# important. At 2 x 400 Hz, the latency p99 of the callbacks was 5 ms; with equal priority it was 14
+# ms.
 _NICENESS = 3
 
-# Fewest poses, received and not paired yet, with which a stream is checked.
+# Fewest unpaired poses with which a stream is checked.
 _MIN_UNPAIRED = 200
 
 NO_MOTION = excitation(PosePairs.empty())
@@ -88,10 +89,10 @@ class Failure:
 
 @dataclass(frozen=True)
 class Job:
-    """Poses to solve.
+    """Poses of a job.
 
-    The job contains the engine's buffers. The process makes trajectories from them, because this
-    work would delay the callbacks of the node.
+    The job contains the buffers of the engine. The process converts them to trajectories, because
+    this would delay the callbacks of the node.
 
     Attributes
     ----------
@@ -104,8 +105,8 @@ class Job:
     options : Options
         Options that an earlier check has set.
     has_hurry : bool
-        Whether the job has the priority of the node. With a lower priority, a solve takes twice as
-        long while other programs keep the processor busy.
+        Whether the job has the priority of the node. With the lower priority, a solve takes twice
+        as long if other programs keep the processor busy.
     """
 
     session: int
@@ -117,7 +118,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a job: a calibration or a failure, or both if only the check has failed.
+    """Result of a job: a calibration, a failure, or both if only the check has failed.
 
     Attributes
     ----------
@@ -135,11 +136,11 @@ class Answer:
     is_checked : bool
         Whether the job requested a check.
     check : CheckResult or None
-        None if the motion is too short for a check, or has too little rotation.
+        Result of the check; None if the motion is too short or has too little rotation.
     options : Options
         Options that the check has set.
     messages : tuple of str
-        Sentences about these options.
+        Sentences about the options that the check has set.
     newest_motion : Excitation or None
         Motion of the last minute.
     processor_s : float
@@ -164,8 +165,8 @@ class Answer:
 def answer(job: Job) -> Answer:
     """Solve, then check the streams if the job requests a check.
 
-    If the check sets options, the calibration is one with these options. Every error becomes a
-    failure in the answer, and what was computed before the error stays.
+    If the check sets options, the calibration is computed with these options. Every error becomes a
+    failure in the answer; what was computed before the error is kept.
     """
     start_s = time.monotonic()
     start_processor_s = time.process_time()
@@ -231,11 +232,11 @@ def _checked(result: Answer, snapshot: Snapshot, options: Options) -> Answer:
 def with_findings_before_pairing(
     result: CheckResult, snapshot: Snapshot
 ) -> CheckResult:
-    """Add errors in the received poses to a check of the pairs, if older poses are paired already.
+    """Add errors in the received poses to a check of pairs.
 
-    Pairing interpolates one stream, and this hides poses of two sources that alternate. So the
-    poses that are not paired yet are checked as they were received. Only errors are added: none of
-    232 windows of sound recordings has one, while 1 of 15 windows has enough jumps for a warning.
+    Pairing interpolates one stream. This hides the poses of two alternating sources. Therefore the
+    unpaired poses are also checked. Only errors are added: none of 232 windows of sound recordings
+    has an error, but 1 of 15 windows has enough jumps for a warning.
     """
     if not len(snapshot.kept):
         return result
@@ -250,8 +251,7 @@ def with_findings_before_pairing(
         if config.measured == "poses":
             findings = check_stream(trajectory, stream, config.max_gap)
         else:
-            # A stream measures its positions only if the streams have positions. Otherwise, the
-            # scale 0 removes them from the check.
+            # If the streams have no positions, the scale 0 removes positions from the check.
             scale = 1.0 if config.measured == "positions" else 0.0
             findings = check_positions(
                 trajectory.scaled(scale), stream, config.max_gap
@@ -265,7 +265,7 @@ def with_findings_before_pairing(
 
 
 def _failure(error: Exception) -> Failure:
-    """Return an error as a failure; with its traceback if the error is a defect of the program."""
+    """Return an error as a failure. A defect of the program includes its traceback."""
     if isinstance(error, HandEyeCalibError):
         return Failure(
             str(error), is_early=isinstance(error, NotEnoughDataError)
@@ -282,13 +282,13 @@ def main() -> None:
 
     Standard input ends with the node, even if the node crashes.
     """
-    # Standard output is the pipe. What a library prints goes to standard error instead.
+    # Standard output is the pipe. Text that a library prints goes to standard error.
     outgoing = os.fdopen(os.dup(1), "wb")
     os.dup2(sys.stderr.fileno(), 1)
     jobs: queue.SimpleQueue[Job] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(jobs,), daemon=True).start()
-    # On Linux, each thread has its own priority. Once lowered, a priority cannot be raised again.
-    # So jobs without hurry have a thread for themselves.
+    # On Linux, each thread has its own priority, which can only be lowered. Therefore jobs that are
+    # not urgent have their own thread.
     at_low_priority = ThreadPoolExecutor(
         1, initializer=os.nice, initargs=(_NICENESS,)
     )
@@ -301,13 +301,13 @@ def main() -> None:
         )
         pickle.dump(result, outgoing, pickle.HIGHEST_PROTOCOL)
         outgoing.flush()
-        # The arrays of a job are in reference cycles. Without a collection, the memory of the
+        # The arrays of a job are in reference cycles. Without this collection, the memory of the
         # process grew by a half in 60 solves.
         gc.collect()
 
 
 def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
-    """Read jobs in a thread, so that the end of the node also ends a long solve."""
+    """Read jobs in a thread, so that a long solve also ends with the node."""
     try:
         while True:
             jobs.put(pickle.load(sys.stdin.buffer))
@@ -321,9 +321,9 @@ def _receive(jobs: "queue.SimpleQueue[Job]") -> None:
 def start(
     code: str, *arguments: str, stdin: Any, stdout: Any
 ) -> "subprocess.Popen[bytes]":
-    """Run Python code with the modules of this process.
+    """Start Python code in a process with the modules of this process.
 
-    The new process has a group of its own, so that Ctrl-C in the terminal does not reach it.
+    The new process has its own group, so that Ctrl-C in the terminal does not reach it.
     """
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
@@ -335,18 +335,18 @@ def start(
 
 
 class SolvingProcess:
-    """A process that answers one job at a time.
+    """Process that answers one job at a time.
 
-    The process starts at once. If the process dies, or hangs and is killed, its job fails and a new
-    process starts. The process ends with the node in any case. The threads of this class only wait
-    for the pipes.
+    The process starts at once. If it dies, or hangs and is killed, its job fails and a new process
+    starts. It ends with the node in any case. The threads of this class only wait for the pipes.
 
     Parameters
     ----------
     on_answer : callable
-        Called in another thread when an answer is ready; :meth:`answers` returns it.
+        Function that is called in another thread when an answer is ready; :meth:`answers` returns
+        it.
     command : str
-        Python code that the process runs.
+        Python code of the process.
     """
 
     def __init__(
@@ -357,12 +357,12 @@ class SolvingProcess:
         self._answers: queue.SimpleQueue[Answer] = queue.SimpleQueue()
         self._is_stopping = False
         self._start()
-        # A thread that does nothing: stop() joins the thread of the last job, if any.
+        # This thread does nothing. stop() joins the thread of the last job, if there was one.
         self._thread = threading.Thread()
         self._thread.start()
 
     def submit(self, job: Job) -> None:
-        """Send a job. The answer to the last job must have arrived."""
+        """Send a job. The answer to the previous job must have arrived."""
         # A daemon thread: a pipe that hangs must not delay the end of the node.
         self._thread = threading.Thread(
             target=self._run, args=(job,), name="solving", daemon=True
@@ -370,7 +370,7 @@ class SolvingProcess:
         self._thread.start()
 
     def answers(self) -> list[Answer]:
-        """Return and remove the answers, in order."""
+        """Return the answers in order, and remove them."""
         return [self._answers.get() for _ in range(self._answers.qsize())]
 
     def stop(self, timeout_s: float) -> None:
@@ -388,7 +388,7 @@ class SolvingProcess:
         )
 
     def _run(self, job: Job) -> None:
-        """Send a job, wait for the answer, and store the answer; kill a process that hangs."""
+        """Send a job, and store the answer. Kill the process if it hangs."""
         to_process: Any = self._process.stdin
         from_process: Any = self._process.stdout
         result = None
@@ -411,7 +411,7 @@ class SolvingProcess:
             self._on_answer()
 
     def _restart(self, has_hung: bool) -> Failure:
-        """Start the process again after its end, and return a failure that names how it ended."""
+        """Start the process again after its end. Return a failure that states how it ended."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE_S)
         self._process.kill()

@@ -1,8 +1,8 @@
-"""The state of the node as one document.
+"""State of the node as one document.
 
-The node publishes the state as JSON; ``/diagnostics`` and ``watch`` are made from the same state.
-All values are in SI units; None means unknown. Mappings by axis have the keys x, y, z, about_x,
-about_y and about_z. Those of a printed pose have roll, pitch and yaw in place of the last three.
+The node publishes the state as JSON. ``/diagnostics`` and ``watch`` use the same state. All values
+are in SI units, and None means unknown. Mappings by axis have the keys x, y, z, about_x, about_y
+and about_z. Mappings of a printed pose have roll, pitch and yaw instead of the last three.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,7 +19,7 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS, Progress
 # Period (s) at which the node publishes its state.
 REPORT_PERIOD_S = 1.0
 
-# When the node stops, it waits at most this time (s) for a disk, a running solve or a slow
+# Longest time (s) for which the stopping node waits for a disk, a running solve or a slow
 # subscriber.
 GRACE_S = 0.4
 
@@ -30,7 +30,7 @@ AxisValues: TypeAlias = Mapping[str, float | None]
 
 
 def as_printed(values: FloatArray) -> AxisValues:
-    """Return x, y, z, roll, pitch, yaw (6,) by name; None for a value that is not finite."""
+    """Return x, y, z, roll, pitch, yaw (6,) by name. A value that is not finite becomes None."""
     return dict(zip(AXES, plain(values), strict=True))
 
 
@@ -72,7 +72,7 @@ Outcome: TypeAlias = tuple[bool, str]
 class Standing(Enum):
     """Validity of the session's result.
 
-    OUTDATED: every solve after this result has failed. REFUTED: the motion contradicts a prior, or
+    OUTDATED: all solves after this result have failed. REFUTED: the motion contradicts a prior, or
     the streams are faulty; such a result is not published.
     """
 
@@ -84,7 +84,7 @@ class Standing(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One part of the node: its condition in words, and whether a person should act."""
+    """Part of the node: its condition in words, and whether a person should act."""
 
     level: Level
     text: str
@@ -100,7 +100,7 @@ class ResultState:
         x, y, z (m), roll, pitch, yaw (rad) as printed, and standard deviations. None for an axis
         that is not determined.
     facts : tuple of str
-        Sentences about the evidence, such as the smallest error that would have shown.
+        Sentences about the evidence, such as the smallest error that would have been noticed.
     caution, step : str
         The gravest reason for the verdict and the next step, in a few words; empty for ``USE``.
     age_s : float
@@ -131,7 +131,7 @@ class ExtrinsicState(Part):
     Attributes
     ----------
     slow : str
-        Sentence about solves that take long, and the reason; empty if they do not.
+        Sentence about slow solves with the reason; empty if solves are fast.
     path_m : float
         Length of the path (m).
     motion_s : float
@@ -142,11 +142,11 @@ class ExtrinsicState(Part):
     rotation_deg : mapping of str to float
         Rotation of the parent sensor about x, y and z (deg).
     tf_static, tf_static_reason
-        Whether the result is broadcast, and the reason if it is not.
+        Whether the result is broadcast; if not, the reason.
     problem : str
         Reason why the result is outdated or refuted; empty otherwise.
     priors : mapping of str to str
-        Priors that are set, by axis.
+        Priors that are set, by axis, as typed by the user.
     contradicted : tuple of str
         Axes whose prior the motion contradicts.
     result : ResultState or None
@@ -179,8 +179,8 @@ class ProgressState(Part):
     progress : Progress
         Standard deviations are along and about the axes of the parent sensor's frame.
     comparison : Comparison or None
-        Comparison of the result with the installed transform, or only a sentence why it is not
-        possible yet. None if no comparison is requested.
+        Comparison of the result with the installed transform. If it is not possible yet, it has a
+        sentence with the reason only. None if no comparison is requested.
     """
 
     is_paused: bool = False
@@ -189,7 +189,7 @@ class ProgressState(Part):
 
 
 class InputCondition(NamedTuple):
-    """The fields of an :class:`InputState` that follow from its messages."""
+    """Fields of an :class:`InputState` that depend on the messages."""
 
     level: Level
     text: str
@@ -208,20 +208,20 @@ class InputState(Part):
     refused : mapping of str to int
         Number of refused messages, by reason.
     lost : int or None
-        Number of messages that were published and never arrived; None if the middleware does not
-        number messages.
+        Number of published messages that never arrived; None if the middleware does not number
+        messages.
     longest_gap_s : float
         Longest interval between two stamps (s).
     publishers : int or None
         Number of publishers of the topic; None for transforms.
     is_paused : bool
-        Whether poses have arrived in this session, but arrive no longer.
+        Whether poses have arrived in this session, but no longer arrive.
     silent_s : float or None
         Time since the last pose (s); None before the first pose of the session.
     step : str
         What a person should do, as a sentence; empty if the text contains it.
     needs_reset : bool
-        Whether the session has poses of several publishers, which only a reset removes.
+        Whether the session has poses of several publishers. Only a reset removes them.
     """
 
     topic: str
@@ -248,9 +248,9 @@ class ChecksState(Part):
         Age of the last check (s); None before the first check.
     findings : tuple of str
     gravest : str
-        The gravest finding that counts, without cause and remedy; empty if there is none.
+        The gravest relevant finding, without cause and remedy; empty if there is none.
     step : str
-        What a person should do about it, as a sentence.
+        Next action of a person, as a sentence.
     needs_reset : bool
         Whether the session keeps the fault until it is reset.
     """
@@ -277,7 +277,7 @@ class JournalState(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class MountState(Part):
-    """A mount that is monitored for a shift of the child sensor.
+    """Mount that is monitored for a shift of the child sensor.
 
     Attributes
     ----------
@@ -339,7 +339,7 @@ class NodeState:
     has_ended : bool
         Whether the node ends, so that this is its last state.
     headline : str
-        What a person should do first, as ``watch`` displays it and as the log contains it.
+        First action of a person. ``watch`` and the log contain the same text.
     """
 
     node: str
@@ -364,7 +364,7 @@ class NodeState:
         return self.extrinsic.standing if self.extrinsic else Standing.NONE
 
     def parts(self) -> Iterator[tuple[str, Part]]:
-        """Yield the parts that the node has, with their names on ``/diagnostics``."""
+        """Yield the parts that the node has, and their names on ``/diagnostics``."""
         parts = {
             "extrinsic": self.extrinsic,
             "progress": self.progress,

@@ -34,9 +34,9 @@ RAW_POSE_CODES = frozenset(
 class StreamChecks:
     """Findings of the stream checks of a session.
 
-    The session reports an error at once. It reports any other finding after two checks in a row,
-    because odometry may be wrong by some per cent over a short recording. It reports an error in
-    the received poses until its end, because the session keeps these poses.
+    An error is reported at once. Any other finding is reported after two checks in a row, because
+    odometry may be wrong by some per cent over a short recording. An error in the received poses is
+    reported until the session ends, because the session keeps these poses.
     """
 
     def __init__(self, log: NodeLog) -> None:
@@ -47,7 +47,7 @@ class StreamChecks:
         """Begin a new session without findings."""
         self._result: CheckResult | None = None
         self._checked_at_s = 0.0
-        # Codes and streams of the findings of the last check, without notes.
+        # Codes and streams of the findings of the last check, except notes.
         self._of_last_check: set[tuple[str, str]] = set()
         # Findings that the session reports, by code and stream.
         self._faults: dict[tuple[str, str], Finding] = {}
@@ -55,7 +55,7 @@ class StreamChecks:
         self._pose_errors: dict[tuple[str, str], Finding] = {}
 
     def follow(self, config: CalibratorConfig) -> None:
-        """Drop errors in the received poses that are no errors with the new options."""
+        """Drop errors in the received poses that the new options repair."""
         errors = {}
         for key, finding in self._pose_errors.items():
             (graded,) = answered([finding], config)
@@ -66,7 +66,7 @@ class StreamChecks:
     def take(self, result: CheckResult) -> None:
         """Store the result of a check, and log findings that appear or disappear.
 
-        The class states when the session reports a finding.
+        The class documents when a finding is reported.
         """
         before = self._faults
         self._result = result
@@ -85,7 +85,7 @@ class StreamChecks:
         for key, finding in self._faults.items():
             if finding.makes_unusable and finding.code in RAW_POSE_CODES:
                 self._pose_errors[key] = finding
-        # Findings of this check have newer values than those of earlier checks.
+        # Values of this check replace older values.
         self._faults = {**self._pose_errors, **self._faults}
         for key in self._faults.keys() - before.keys():
             self._log.warning(_in_parameters(self._faults[key]))
@@ -93,7 +93,7 @@ class StreamChecks:
             self._log.info(f"no longer found: {before[key].what}")
 
     def with_open_errors(self, calibration: Calibration) -> Calibration:
-        """Return a calibration whose allowance contains what the last check left open."""
+        """Return a calibration whose allowance includes the open covariance of the last check."""
         return (
             calibration
             if self._result is None
@@ -136,7 +136,7 @@ def merged(
 ) -> tuple[Finding, ...]:
     """Return the newest findings and all other earlier findings, the gravest first.
 
-    An earlier finding is dropped if a newest finding has the same code and stream.
+    An earlier finding is dropped if a new finding has the same code and stream.
     """
     keys = {(finding.code, finding.stream) for finding in newest}
     kept = [
@@ -148,7 +148,7 @@ def merged(
 
 
 def _gravest_of(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Return the fields of a state about the gravest of the reported findings."""
+    """Return the fields of a state that describe the gravest of the reported findings."""
     if not findings:
         return {}
     gravest = findings[0]

@@ -1,6 +1,6 @@
-"""The node: topics, services, parameters and timers around the live session.
+"""ROS 2 node: topics, services, parameters and timers around the live session.
 
-Solves run in a process of their own. All other code runs in the one thread of the executor, so no
+Solves run in a separate process. All other code runs in the single thread of the executor, so no
 lock is needed.
 """
 
@@ -71,8 +71,8 @@ class CalibratorNode(ManagedNode):
         If a parameter given at the start is unusable.
     """
 
-    # The inputs report incompatible QoS themselves. rclpy's default event callbacks are off: they
-    # would cost, in every cycle of the executor, as much time as a message.
+    # The inputs report incompatible QoS themselves. So rclpy's default event callbacks are switched
+    # off: in every cycle of the executor, they take as much time as a message.
     create_publisher = partialmethod(
         Node.create_publisher,
         event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
@@ -116,7 +116,7 @@ class CalibratorNode(ManagedNode):
         """
         options = self._options.node
         config = self._options.calibrator
-        # From now on, participants may only choose a directory below this directory.
+        # From now on, participants may only choose a directory below this one.
         self._output_base = output_path(
             options.output_directory or "."
         ).resolve()
@@ -161,18 +161,18 @@ class CalibratorNode(ManagedNode):
         self._log_start()
 
     def take_messages(self) -> bool:
-        """Process the messages that wait at the inputs; return whether there were any."""
+        """Process the messages that wait at the inputs. Return whether there were any."""
         had_messages = [source.take_waiting() for source in self._inputs]
         return any(had_messages)
 
     def stop(self, timeout_s: float) -> bool:
-        """End the solving process and save the newest result; return False if that failed."""
+        """End the solving process and save the newest result. Return False if the save failed."""
         if not self.is_configured:
             return True
         self._cycle.stop(timeout_s)
         is_saved = True
         if self._mount is not None and self._options.node.output_directory:
-            # A session that is too short for a digest is no failure.
+            # A session may be too short for a digest. This is no failure.
             self._save_digest()
         elif self._cycle.result is not None:
             if self._options.node.output_directory:
@@ -187,7 +187,7 @@ class CalibratorNode(ManagedNode):
         return is_saved
 
     def accept_poses(self, accept: bool) -> None:
-        """Accept poses, or no longer."""
+        """Accept or ignore poses from now on."""
         for source in self._inputs:
             source.is_enabled = accept
         self._log.info("accepting poses" if accept else "not accepting poses")
@@ -244,7 +244,7 @@ class CalibratorNode(ManagedNode):
         )
 
     def _make_input(self, name: str) -> TopicInput | TfInput:
-        """Return the input of a sensor: from transforms if an option names frames for it."""
+        """Return the input of a sensor: transforms if an option names its frames, else a topic."""
         options = self._options.node
         parts = self._session, self._log, self._begin_session
         source: TopicInput | TfInput
@@ -260,11 +260,11 @@ class CalibratorNode(ManagedNode):
 
     def _serve(self) -> None:
         """Advertise the services."""
-        # A long queue, because requests also arrive while the node is busy.
+        # The queue is long, because requests also arrive while the node is busy.
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         serve = partial(self.create_service, qos_profile=qos)
-        # A group of its own: while this callback awaits a solve, no other callback of its group
-        # could run.
+        # This service has its own callback group. While its callback awaits a solve, no other
+        # callback of the group can run.
         serve(
             Trigger,
             "~/solve",
@@ -278,16 +278,16 @@ class CalibratorNode(ManagedNode):
         )
 
     def _start_timers(self) -> None:
-        """Start the timers for solves and for all other periodic tasks."""
-        # Steady time goes on while a bag, and with it simulated time, is paused.
+        """Start the timers for solves and for other periodic tasks."""
+        # Steady time continues while a bag, and with it simulated time, is paused.
         make_timer = partial(
             self.create_timer, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self._solve_timer = make_timer(
             self._options.node.solve_period, self._on_solve_timer
         )
-        # The tasks of a second, in order: all at once would delay messages on a slow computer.
-        # Every second call flushes the journal; the calls between publish once and then discover.
+        # Tasks of a second, in order. Together they would delay messages on a slow computer. Every
+        # second call flushes the journal. The calls between publish first, and then discover.
         flush = self._session.flush_journal
         tasks = [flush, self._publish]
         for _ in range(round(REPORT_PERIOD_S / FLUSH_PERIOD_S) - 1):
@@ -319,12 +319,12 @@ class CalibratorNode(ManagedNode):
         self._cycle.start_if_due()
 
     def _publish(self, has_ended: bool = False) -> None:
-        """Publish result and state together, so that the topics always agree."""
+        """Publish result and state together, so that all topics agree."""
         self._results.publish(self._cycle.published)
         self._tf.update(self._cycle.result, self._why_not_broadcast())
         if self._mount is not None:
             self._mount.look()
-        # Messages may wait in the queues on a slow computer: count them before the state is made.
+        # On a slow computer messages may wait in the queues. Count them before the state is made.
         if not has_ended:
             self.take_messages()
         clock_ns = self.get_clock().now().nanoseconds
@@ -362,8 +362,8 @@ class CalibratorNode(ManagedNode):
         name = self.get_fully_qualified_name()
         steady_s = time.monotonic()
         accepts_poses = self._inputs[0].is_enabled
-        # Once there is a result, the robot may be parked, and silent inputs are normal. An input
-        # without a publisher is reported all the same, until the goal is reached.
+        # With a result, the robot may be parked, and silent inputs are normal. An input without a
+        # publisher is still reported, until the goal is reached.
         silent = [source.is_silent(steady_s) for source in self._inputs[:2]]
         is_parked = cycle.published is not None and all(silent)
         is_done = cycle.goal.progress.done
@@ -394,7 +394,7 @@ class CalibratorNode(ManagedNode):
         Parameters
         ----------
         because_of : PoseInput, optional
-            The input whose stamps have jumped back; None if a person has asked for a new session.
+            Input whose stamps have jumped back; None if a person requested the new session.
         """
         self._session.reset()
         if self._mount is not None and because_of is None:
@@ -413,7 +413,7 @@ class CalibratorNode(ManagedNode):
     async def _on_solve(
         self, request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
-        """Solve, and answer the request when the solve has ended."""
+        """Solve. Answer the request when the solve has ended."""
         solved = Future()
         self._cycle.ask(
             lambda is_good, text: solved.set_result((is_good, text))
@@ -424,7 +424,7 @@ class CalibratorNode(ManagedNode):
     def _answer(
         self, act: Callable[[Any], Outcome], request: Any, response: Any
     ) -> Any:
-        """Call ``act`` with a request, and answer with its success and its line of text."""
+        """Call ``act`` with a request, and fill the response with its success and its text."""
         response.success, response.message = act(request)
         self._publish()
         return response
@@ -447,7 +447,7 @@ class CalibratorNode(ManagedNode):
         return self._saver.save(self._options.node)
 
     def _reset(self, request: Trigger.Request) -> Outcome:
-        """Begin a new session; the answer names the priors, which stay."""
+        """Begin a new session. The response names the priors, which are kept."""
         self._begin_session()
         text = "all poses discarded, new session"
         priors = priors_of(self._options.calibrator)
@@ -486,7 +486,7 @@ class CalibratorNode(ManagedNode):
             output_path(options.output_directory, self._output_base)
 
     def _follow_parameters(self, before: CalibratorConfig) -> None:
-        """Apply changed parameters; ``before`` are the options of the engine before the change."""
+        """Apply changed parameters. ``before`` has the earlier options of the engine."""
         if not self.is_configured:
             return
         options = self._options.node

@@ -12,8 +12,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration
 
-# Length of a queue of messages. It holds several seconds of a fast stream. For /tf_static, this is
-# the number of publishers whose last message a late subscriber receives.
+# Length of a queue of messages: several seconds of a fast stream. For /tf_static, it is the number
+# of publishers whose last message a late subscriber receives.
 _QUEUE = 1000
 
 _RELIABLE = ReliabilityPolicy.RELIABLE
@@ -27,9 +27,9 @@ LISTENING = QoSProfile(
 
 
 def quick() -> QoSProfile:
-    """Return a new best-effort QoS, with which a subscription also receives reliable messages.
+    """Return a new best-effort QoS, which also receives reliable messages.
 
-    Every subscription needs its own object, because rclpy writes QoS overrides into the object.
+    rclpy writes QoS overrides into the object, so every subscription needs its own object.
     """
     return QoSProfile(
         depth=_QUEUE,
@@ -61,8 +61,8 @@ def to_transform(
     ----------
     calibration : Calibration
     is_mounting : bool
-        Use ``calibration.mounting``: the pose in the frame on which the child sensor is mounted
-        (the base frame, if there is one) replaces the pose in the parent sensor's frame.
+        Use ``calibration.mounting``, the pose in the frame on which the child sensor is mounted:
+        the base frame if there is one, otherwise the frame of the parent sensor.
     """
     frame = calibration.parent_frame
     T = calibration.T_parent_child

@@ -1,4 +1,4 @@
-"""The inputs of the node: subscriptions to a topic of poses or to transforms."""
+"""Inputs of the node: subscriptions to a topic with poses, or to transforms."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -41,7 +41,7 @@ _QOS_OVERRIDES = (
     QoSPolicyKind.RELIABILITY,
 )
 
-# Message types in the order of preference, without the first entry of POSE_TYPES, "auto".
+# Message types in the order of preference. The first entry of POSE_TYPES, "auto", is left out.
 _TYPES = (*POSE_TYPES[1:], *LIVE_READINGS)
 
 # Errors that rclpy raises for QoS overrides that it cannot apply.
@@ -69,16 +69,16 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
-        # Subscriptions with their callbacks. The arguments of a callback are a message and rclpy's
-        # information about the message.
+        # Subscriptions with their callbacks. A callback gets a message, and rclpy's information
+        # about it.
         self._subscribed: list[
             tuple[Subscription, Callable[[Any, Mapping[str, int]], None]]
         ] = []
 
     def take_waiting(self) -> bool:
-        """Process the messages that wait in the queues; return whether there were any.
+        """Process the messages that wait in the queues. Return whether there were any.
 
-        Messages are taken from rclpy directly, because the executor needs much longer for one.
+        Messages are taken from rclpy directly, because the executor takes much longer per message.
         """
         before = self._arrived
         for subscription, callback in self._subscribed:
@@ -88,7 +88,7 @@ class RosInput(PoseInput):
             )
             with handle:
                 # take() returns None at the end of the queue. The limit is for a queue that fills
-                # as fast as it is emptied.
+                # as fast as messages are taken.
                 for message in islice(
                     iter(take, None), subscription.qos_profile.depth
                 ):
@@ -104,7 +104,7 @@ class TopicInput(RosInput):
     node : rclpy.node.Node
     name : str
     wanted_type : str
-        Message type, or "auto" for the type that the publishers have.
+        Message type, or "auto" for the type of the publishers.
     parts : tuple
         See :class:`RosInput`.
     """
@@ -122,13 +122,13 @@ class TopicInput(RosInput):
         self._type_name = ""
 
     def discover(self) -> None:
-        """Subscribe as soon as the message type is known. This method must be called often.
+        """Subscribe as soon as the message type is known. Call this method often.
 
         Raises
         ------
         ConfigError
-            If the type that the options request cannot be used. If the type of the publishers
-            cannot be used, the log has an error instead.
+            If the type that the options request is unusable. If the type of the publishers is
+            unusable, the log gets an error instead.
         """
         # Unlike count_publishers, this method of rclpy applies remappings to the topic.
         publishers = self._node.get_publishers_info_by_topic(
@@ -171,7 +171,7 @@ class TopicInput(RosInput):
         return self._wanted_type
 
     def _wrong_qos(self, publishers: Sequence[TopicEndpointInfo]) -> str:
-        """Return why the middleware delivers no message of these publishers; empty if it does."""
+        """Return the reason why the middleware cannot deliver messages; empty if it can."""
         offered = {
             publisher.qos_profile.reliability for publisher in publishers
         }
@@ -203,8 +203,8 @@ class TopicInput(RosInput):
         else:
             origin = self._session.origin(self.name)
             self._read = unpacking.MessageReader(type_name, measures, origin)
-        # rclpy passes the information about a message to any callback with two arguments. The
-        # annotations of rclpy do not allow such a callback, hence Any.
+        # rclpy passes the information about a message to any callback with two arguments. Its
+        # annotations do not allow such a callback, so the type is Any.
         callback: Any = self._receive
         try:
             subscription = self._node.create_subscription(
@@ -212,8 +212,8 @@ class TopicInput(RosInput):
                 self._relative_topic,
                 callback,
                 quick(),
-                # The callback receives bytes. Reading the pose from the bytes takes a tenth of the
-                # time in which rclpy makes the objects of a message.
+                # The callback receives bytes. Reading a pose from bytes takes a tenth of the time
+                # in which rclpy makes the objects of a message.
                 raw=True,
                 qos_overriding_options=QoSOverridingOptions(_QOS_OVERRIDES),
             )
@@ -246,7 +246,7 @@ class TopicInput(RosInput):
 
 
 class TfInput(RosInput):
-    """The poses of parent or child from ``/tf`` and ``/tf_static``."""
+    """Poses of parent or child from ``/tf`` and ``/tf_static``."""
 
     def __init__(
         self, node: Node, name: str, source: TfSource, parts: Parts
@@ -272,7 +272,7 @@ class TfInput(RosInput):
         self._stream.max_gap_s = config.max_gap
 
     def discover(self) -> None:
-        """Update the reason why there are no poses. This method must be called often."""
+        """Update the reason for missing poses. Call this method often."""
         self.problem = self._stream.describe_missing()
 
     def _receive(

@@ -1,4 +1,4 @@
-"""The node as a managed node: its transitions, as in the design of ROS 2 lifecycle nodes.
+"""Managed node: its transitions, as in the design of ROS 2 lifecycle nodes.
 
 =============  ==========================================================================
 State          What the node has in this state
@@ -31,7 +31,8 @@ _DONE = TransitionCallbackReturn.SUCCESS
 class ManagedNode(LifecycleNodeMixin, Node):
     """A node that another program may configure, activate, deactivate and clean up.
 
-    A subclass makes what it needs in :meth:`configure`, and ends its work in :meth:`stop`.
+    A subclass makes its topics, services and timers in :meth:`configure`, and ends its work in
+    :meth:`stop`.
 
     Attributes
     ----------
@@ -48,13 +49,13 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._made = ExitStack()
 
     def manage(self) -> None:
-        """Serve the transitions. From now on, only transitions configure the node."""
+        """Serve the transitions. After this call, only transitions configure the node."""
         LifecycleNodeMixin.__init__(self)
         change_state = self._service_change_state.callback
 
         def change_state_if_possible(request: Any, response: Any) -> Any:
-            # rclpy raises an error for a transition that the present state does not have, such as
-            # a second activation. The error would end the node.
+            # rclpy raises an error for a transition that is impossible in the present state, such
+            # as a second activation. The error would end the node.
             try:
                 return change_state(request, response)
             except RCLError:
@@ -83,11 +84,11 @@ class ManagedNode(LifecycleNodeMixin, Node):
         raise NotImplementedError
 
     def stop(self, timeout_s: float) -> bool:
-        """Save the result and end the session; return False if the result could not be saved."""
+        """Save the result and end the session. Return False if the save failed."""
         raise NotImplementedError
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Make topics, services and timers. If this fails, the log has the reason."""
+        """Make topics, services and timers. If this fails, the log contains the reason."""
         self._made = ExitStack()
         self._destroy_later()
         try:
@@ -105,14 +106,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return _DONE
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Ignore poses; results stay published."""
+        """Ignore poses. Results remain published."""
         self.accept_poses(False)
         return _DONE
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Save the result, end the session, and destroy topics, services and timers."""
         if self.is_configured:
-            # The log has a warning if the result cannot be saved.
+            # If the result cannot be saved, the log contains a warning.
             self.stop(GRACE_S)
         self.is_configured = False
         self._made.close()
@@ -123,11 +124,11 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.on_cleanup(state)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Do what a cleanup does after an exception; the node can be configured again."""
+        """Do what a cleanup does after an exception. The node can be configured again."""
         return self.on_cleanup(state)
 
     def _destroy_later(self) -> None:
-        """Register the destruction of all publishers, subscriptions and so on made from now on."""
+        """Register for destruction all publishers, subscriptions and so on made from now on."""
         kinds: dict[str, Callable[[Any], object]] = {
             "publishers": self.destroy_publisher,
             "subscriptions": self.destroy_subscription,

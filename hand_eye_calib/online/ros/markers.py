@@ -23,9 +23,9 @@ _TEXT_M = 0.04
 
 # Radius of the ellipsoid, in standard deviations.
 _SIGMAS = 3.0
-# Smallest radius (m) of the ellipsoid: a smaller one is invisible.
+# Smallest radius (m) of the ellipsoid. A smaller ellipsoid is invisible.
 _MIN_RADIUS_M = 1e-3
-# Largest radius (m) of the ellipsoid: that of an unobservable axis would hide the scene.
+# Largest radius (m) of the ellipsoid. That of an unobservable axis would hide the scene.
 _MAX_RADIUS_M = 1.0
 
 _RED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=1.0)
@@ -54,7 +54,7 @@ def to_markers(calibration: Calibration | None) -> MarkerArray:
     Without a result, the message only deletes the markers of earlier results.
     """
     message = MarkerArray()
-    # RViz keeps a marker until it is deleted. The new result may have fewer markers.
+    # RViz shows a marker until it is deleted, and the new result may have fewer markers.
     message.markers.append(Marker(action=Marker.DELETEALL))
     if calibration is not None:
         for marker in _markers(calibration):

@@ -1,6 +1,6 @@
-"""Entry point of the node ``calibrator``: start, spin, and a clean end after a signal.
+"""Entry point of the node ``calibrator``: start, spin, and clean end after a signal.
 
-ROS and the engine are imported late, so that Ctrl-C during their import ends the program quietly.
+ROS and the engine are imported late, so that Ctrl-C during the import ends the program quietly.
 """
 
 import gc
@@ -14,7 +14,7 @@ import traceback
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# Pause (s) before waiting messages are taken without the executor. A wait of the executor takes as
+# Pause (s) before waiting messages are taken without the executor. Waiting in the executor takes as
 # much processor time as ten messages.
 _PAUSE_S = 0.003
 # Longest time (s) for which messages are taken without the executor.
@@ -35,8 +35,8 @@ def main(args: list[str] | None = None) -> int:
         Exit code: 0 stopped by a signal; 1 bad parameter, failure, or a result that could not be
         saved (reported on stderr); 2 wrong usage.
     """
-    # A signal only makes this pipe readable. So no KeyboardInterrupt interrupts a callback, rclpy
-    # does not shut down its context while a callback publishes, and a second Ctrl-C has no effect.
+    # A signal only makes this pipe readable. Therefore no KeyboardInterrupt interrupts a callback,
+    # rclpy does not shut down its context during a callback, and a second Ctrl-C has no effect.
     readable, writable = os.pipe()
     os.set_blocking(writable, False)
     signal.set_wakeup_fd(writable, warn_on_full_buffer=False)
@@ -51,7 +51,7 @@ def main(args: list[str] | None = None) -> int:
 
 
 def _init(arguments: list[str]) -> int:
-    """Start rclpy; return the exit code, 0 if it has started."""
+    """Start rclpy and return the exit code, which is 0 after a successful start."""
     import rclpy
     from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
     from rclpy.logging import LoggingSeverity, set_logger_level
@@ -62,7 +62,7 @@ def _init(arguments: list[str]) -> int:
         print(f"calibrator: {text}", file=sys.stderr)
         return code
 
-    # Silence rcl: it logs an error before it raises the same error with the cause.
+    # rcl logs an error before it raises the same error with the cause. Suppress the log.
     set_logger_level("rcl", LoggingSeverity.FATAL)
     try:
         if unknown := remove_ros_args(args=arguments):
@@ -99,7 +99,7 @@ def _run_node(signals: int) -> int:
 
     def wait_for_signal() -> None:
         os.read(signals, 1)
-        # executor.wake() would not make spin_once() return; a task does.
+        # executor.wake() does not make spin_once() return, but a task does.
         executor.create_task(stopping.set)
 
     threading.Thread(
@@ -110,12 +110,12 @@ def _run_node(signals: int) -> int:
     try:
         node = CalibratorNode()
         executor.add_node(node)
-        # Import the modules of results now: at the first result, this would delay messages by
+        # Import the modules of results now. At the first result, the import would delay messages by
         # 40 ms.
         for make_part in RESULT_PARTS.values():
             make_part()
-        # Exclude all objects that exist by now from garbage collections. With them, a collection
-        # delays callbacks by 30 ms, on a slow computer by 250 ms.
+        # Exclude all present objects from garbage collection. With them, a collection delays
+        # callbacks by 30 ms, and by 250 ms on a slow computer.
         gc.collect()
         gc.freeze()
         # Longest time (s) for which the thread of the journal delays a message.

@@ -1,4 +1,4 @@
-"""The publishers of the node, for its results and its state."""
+"""Publishers of the node, for its results and its state."""
 
 import json
 from collections.abc import Iterator
@@ -26,18 +26,18 @@ from hand_eye_calib.online.ros.conversions import (
 from hand_eye_calib.online.ros.markers import to_markers
 
 PROGRESS_TOPIC = "progress"
-# Longest time that the end of the node waits until subscribers have received its last state.
+# Longest time for which the ending node waits until subscribers have received its last state.
 _GRACE = Duration(seconds=GRACE_S)
 
-# Keys of the mappings by axis: those of a printed pose, and those of all other mappings.
+# Keys of all mappings by axis.
 _AXIS_NAMES = {*AXES, *AXIS_KEYS.values()}
 
-# Keys of the state that are not part of the names of values on /diagnostics.
+# Keys of the state that are left out of the names of values on /diagnostics.
 _OMITTED = ("progress", "axes", "result", "differences")
 
 
 class ResultTopics:
-    """Publishes results on ``~/extrinsic``, ``~/extrinsic_with_covariance`` and ``~/markers``.
+    """Publish results on ``~/extrinsic``, ``~/extrinsic_with_covariance`` and ``~/markers``.
 
     All topics are latched: late subscribers receive the last message.
     """
@@ -59,11 +59,11 @@ class ResultTopics:
         )
 
     def publish(self, calibration: Calibration | None) -> None:
-        """Publish a result if it is new; None withdraws the earlier result.
+        """Publish a result if it is new. None withdraws the earlier result.
 
-        Axes that are not determined are zero in the messages. So ``~/extrinsic``, which has no
-        covariance, is published only if the rotation and two axes of the translation are
-        determined. Late subscribers do not receive a message that was withdrawn.
+        An axis that is not determined is zero in the messages. ``~/extrinsic`` has no covariance,
+        so it is published only if the rotation and two axes of the translation are determined. Late
+        subscribers do not receive a withdrawn message.
         """
         if calibration is self._newest:
             return
@@ -81,14 +81,14 @@ class ResultTopics:
         self._pose.publish(to_pose_with_covariance(calibration))
 
     def _withdraw(self) -> None:
-        """Replace the publishers, so that late subscribers receive no message of the old ones."""
+        """Replace the publishers, so that late subscribers receive no old message."""
         for publisher in (self._transform, self._pose):
             self._node.destroy_publisher(publisher)
         self._advertise()
 
 
 class StateTopics:
-    """Publishes the node's state: as JSON on ``~/progress``, latched, and on ``/diagnostics``."""
+    """Publish the state of the node as JSON on ``~/progress`` (latched) and on ``/diagnostics``."""
 
     def __init__(self, node: Node) -> None:
         self._progress = node.create_publisher(
@@ -136,11 +136,11 @@ def _values(
 ) -> Iterator[tuple[str, str]]:
     """Yield the name and the text of each value in a part of the state.
 
-    A name consists of the keys that lead to the value, the axis last, such as ``sigma.x``. ``path``
-    are the keys that lead to ``value``.
+    A name consists of the keys that lead to the value, with the axis last, such as ``sigma.x``.
+    ``path`` has the keys that lead to ``value``.
     """
-    # The first of several differences is the difference from the installed transform. Only this
-    # difference is shown.
+    # The first of several differences is the difference from the installed transform. Only this one
+    # is published.
     if isinstance(value, list) and value and isinstance(value[0], dict):
         value = value[0]
     if isinstance(value, dict):

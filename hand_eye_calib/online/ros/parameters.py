@@ -1,4 +1,4 @@
-"""The parameters of the node, made from the option dataclasses."""
+"""Parameters of the node, made from the dataclasses of options."""
 
 from collections.abc import Callable
 from typing import Any
@@ -29,28 +29,29 @@ _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
 
 
 class Parameters:
-    """Declares the parameters on a node and stores them as option objects.
+    """Declare the parameters on a node, and store them as objects of options.
 
-    The node must have been made with ``automatically_declare_parameters_from_overrides=True``. Then
-    rclpy lists the values of files and of the command line, also those with unknown names.
+    The node must have been made with ``automatically_declare_parameters_from_overrides=True``.
+    rclpy then lists the values from files and from the command line, including unknown names.
 
     Parameters
     ----------
     node : rclpy.node.Node
     on_change : callable
-        Called after a change of parameters, with the former CalibratorConfig. The attributes
-        ``calibrator`` and ``node`` are the new options then.
+        Function that is called after a change of parameters with the earlier CalibratorConfig. At
+        this time the attributes ``calibrator`` and ``node`` have the new options.
     check : callable
-        Called with a NodeConfig; raises ConfigError for options that cannot be applied.
+        Function that is called with a NodeConfig. It raises ConfigError for options that cannot be
+        applied.
 
     Attributes
     ----------
     given : dict
-        Values that the user has set, even if equal to their defaults.
+        Values that the user has set, including values that equal their defaults.
     calibrator : CalibratorConfig
     node : NodeConfig
     unknown : list of str
-        One line for every parameter that does not exist and is not a QoS override.
+        A line for each parameter that does not exist, except QoS overrides.
 
     Raises
     ------
@@ -78,7 +79,7 @@ class Parameters:
             for name in overrides
             if name not in FIELDS and not name.startswith("qos_overrides.")
         ]
-        # In YAML, the word off without quotes means false.
+        # YAML reads the word off without quotes as false.
         if overrides.get("journal") is False:
             overrides["journal"] = "off"
         self.given = _checked(overrides)
@@ -100,7 +101,7 @@ class Parameters:
         return {**self.given, **_checked(changes)}
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Accept or refuse a change, before it is applied."""
+        """Accept or refuse a change before it is applied."""
         try:
             _, node = _configs(self._proposed(parameters))
             self._check_node(node)
@@ -146,7 +147,7 @@ def _descriptor(field: OptionField) -> ParameterDescriptor:
     """Return description, type and range of a parameter for ``ros2 param describe``."""
     meta = field.metadata
     words = meta["choices"]
-    # A parameter whose value is a number or a word, such as "estimate", has no fixed type.
+    # A value that is a number or a word, such as "estimate", has no fixed type.
     is_dynamic = bool(meta["words"])
     if is_dynamic and not words:
         words = (f"{' or '.join(meta['words'])}, or a number",)

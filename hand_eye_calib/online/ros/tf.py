@@ -1,7 +1,7 @@
-"""The transform tree of the robot.
+"""Transform tree of the robot.
 
 The installed transform and the base frame are read from the tree. The result is broadcast on
-``/tf_static`` once the goal is reached, and never as a second parent of a frame.
+``/tf_static`` after the goal is reached, but never as a second parent of a frame.
 """
 
 import contextlib
@@ -43,13 +43,13 @@ from hand_eye_calib.online.ros.conversions import (
     to_transform,
 )
 
-# Value of the option ``installed`` for the transform on /tf_static.
+# Value of the option ``installed`` that stands for the transform on /tf_static.
 TF = "tf"
 STATIC_TOPIC = "/tf_static"
 DYNAMIC_TOPIC = "/tf"
 
-# Time (s) for which the node receives the transform tree before it broadcasts. Discovery of other
-# publishers takes up to 2.4 s.
+# Time (s) for which the transform tree is received before the result is broadcast. The discovery of
+# other publishers takes up to 2.4 s.
 LOOK_S = 5.0
 
 
@@ -72,12 +72,12 @@ def message_type(wanted_by: str = "publish_tf") -> type[Any]:
 
 
 class RobotTree(FrameTree):
-    """Edges that other nodes broadcast. If a frame gets a second parent, its first parent stays.
+    """Edges that other nodes broadcast. If a frame gets a second parent, its first parent is kept.
 
     Attributes
     ----------
     own : deque of TransformStamped
-        The last transforms that this node has broadcast. They are ignored when they are received.
+        The last transforms that this node has broadcast. They are ignored if they are received.
     """
 
     def __init__(self, node: Node, log: NodeLog) -> None:
@@ -101,7 +101,7 @@ class RobotTree(FrameTree):
             self._node.destroy_subscription(self._subscriptions.pop(topic))
 
     def what_forbids(self, parent: str, child: str) -> str:
-        """Return why the edge ``parent -> child`` must not be broadcast; empty if it may."""
+        """Return why the edge ``parent -> child`` must not be broadcast; empty if it may be."""
         if edge := self.edges.get(child):
             topic = STATIC_TOPIC if edge.is_static else DYNAMIC_TOPIC
             if edge.parent == parent:
@@ -134,14 +134,14 @@ class RobotTree(FrameTree):
 
 
 class Robot:
-    """Adds the installed transform and the base frame of the robot to results.
+    """Add the installed transform and the base frame of the robot to results.
 
     The options ``installed`` and ``base_frame`` do not change while the node runs.
 
     Attributes
     ----------
     problem : str
-        Reason why the installed transform or the base frame is unknown; empty if they are known, or
+        Reason why the installed transform or the base frame is unknown. Empty if they are known, or
         if no option requests them.
 
     Raises
@@ -158,7 +158,7 @@ class Robot:
         self._source = options.installed
         self._base_frame = options.base_frame
         self.problem = ""
-        # Installed transform between the two frames of the last result.
+        # Installed transform between the frames of the last result.
         self._installed: Extrinsic | None = None
         self._installed_for = ("", "")
         from_tree = partial(stated, frames.pose, STATIC_TOPIC)
@@ -173,7 +173,7 @@ class Robot:
     ) -> Extrinsic | None:
         """Return the installed transform; None if it is unknown, or if no option requests it."""
         frames = parent_frame, child_frame
-        # Inverted poses exchange the frames of their stream.
+        # Inverted poses exchange the two frames of their stream.
         if frames != self._installed_for:
             self._installed = None
         if self._installed is None and self._source:
@@ -189,10 +189,10 @@ class Robot:
         return self._installed
 
     def complete(self, calibration: Calibration) -> Calibration:
-        """Return a usable result with its comparison and its pose in the base frame, if known.
+        """Return a usable result with its comparison, and its pose in the base frame if known.
 
-        If one axis of the translation, and no other axis, is not observable, this axis gets its
-        installed value.
+        If the translation along one axis is the only unobservable value, it is set to its installed
+        value.
         """
         installed = self.installed(
             calibration.parent_frame, calibration.child_frame
@@ -219,7 +219,7 @@ class Robot:
 
     @property
     def why_not_compared(self) -> str:
-        """Reason why the result is not compared; empty if no option requests a comparison."""
+        """Reason why the result is not compared; empty if no comparison is requested."""
         return (self.problem or "no result yet") if self._source else ""
 
     def _report(self, problem: str) -> None:
@@ -231,7 +231,7 @@ class Robot:
 def _with_axis_of(
     installed: Extrinsic, calibration: Calibration
 ) -> Calibration:
-    """Return a result whose only unobservable axis has the installed value.
+    """Return a result whose only unobservable axis has its installed value.
 
     The result is unchanged if several axes are unobservable, or if the axis is roll, pitch or yaw.
     """
@@ -245,8 +245,8 @@ def _with_axis_of(
     T = calibration.T_parent_child.copy()
     covariance = turned(se3.rotation_of(T), calibration.covariance_measured)
     missing = float(installed.T_parent_child[index, 3] - T[index, 3])
-    # The errors of the other axes are correlated with the error of this axis: shift each of them by
-    # its regression on this axis.
+    # The errors of the other axes are correlated with the error of this axis. Shift them by their
+    # regression on this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
     warning = f"{axis} is that of the installed transform ({installed.origin})"
     return replace(
@@ -255,12 +255,12 @@ def _with_axis_of(
 
 
 class TfBroadcaster:
-    """Broadcasts the result on ``/tf_static`` once the session has reached its goal.
+    """Broadcast the result on ``/tf_static`` after the session has reached its goal.
 
     Attributes
     ----------
     state : (Broadcast, str)
-        Whether the result is broadcast, and the reason if it is not.
+        Whether the result is broadcast; if not, the reason.
     """
 
     def __init__(self, node: Node, log: NodeLog, tree: RobotTree) -> None:
@@ -273,7 +273,7 @@ class TfBroadcaster:
         self._publisher: Any = None
 
     def switch(self, on: bool) -> None:
-        """Switch broadcasting on or off. A subscriber keeps the last edge until it restarts."""
+        """Switch the broadcast on or off. A subscriber keeps the last edge until it restarts."""
         if on == self._is_on:
             return
         self._is_on = on
@@ -285,13 +285,13 @@ class TfBroadcaster:
             self._tree.ignore(DYNAMIC_TOPIC)
 
     def update(self, result: Calibration | None, why_not: str) -> None:
-        """Broadcast a new result if the tree permits that. This method must be called often.
+        """Broadcast a new result if the tree permits this. Call this method often.
 
         Parameters
         ----------
         result : Calibration or None
         why_not : str
-            Reason why the result must not be broadcast yet; empty if it may.
+            Reason why the result must not be broadcast yet; empty if it may be broadcast.
         """
         # Discovery takes seconds, so the publisher is made before the first message.
         if self._is_on and self._publisher is None:
@@ -314,13 +314,13 @@ class TfBroadcaster:
     def _decide(
         self, result: Calibration | None, why_not: str
     ) -> BroadcastState:
-        """Return whether to broadcast a result, and the reason if not."""
+        """Return whether to broadcast a result; if not, the reason."""
         if not self._is_on:
             return Broadcast.OFF, ""
         if result is None:
             return Broadcast.WAITING, why_not
         was_checked = time.monotonic() - self._began_s >= LOOK_S
-        # A tree that forbids the edge is reported before the goal is reached.
+        # If the tree forbids the edge, report this before the goal is reached.
         if was_checked and (reason := self._what_forbids(result)):
             return Broadcast.REFUSED, reason
         if why_not:
@@ -347,8 +347,8 @@ class TfBroadcaster:
         return reason
 
     def _broadcast(self, result: Calibration, is_first: bool) -> None:
-        """Publish the edge of a result if it is new, or the first one."""
-        # The tree is checked by now. /tf may be fast, so it is not received any longer.
+        """Publish the edge of a result if it is new or the first."""
+        # The tree has been checked. /tf may be fast, so stop receiving it.
         self._tree.ignore(DYNAMIC_TOPIC)
         own = self._tree.own
         transform = to_transform(result, True)

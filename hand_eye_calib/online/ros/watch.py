@@ -28,15 +28,15 @@ examples:
 # Default port of the page: not 8765, which foxglove_bridge uses.
 _PORT = 8775
 
-# Longest wait (s) for a message. Keys and requests of a browser are processed after the wait.
+# Longest wait (s) for a message. Keys and requests of a browser are processed after it.
 _MAX_WAIT_S = 0.1
 
-# Time (s) within which a second press of a key confirms its request.
+# A second press of a key within this time (s) confirms a request.
 _CONFIRM_WITHIN_S = 5.0
 
 _REQUESTS = {key: request for request, key in KEYS.items()}
 
-# Requests that need a second press of their key, and the consequence of each request.
+# Requests that need a second press of their key, with their consequences.
 _CONSEQUENCES = {
     "reset": "forgets all poses",
     "recalibrate": "stops watching and calibrates anew",
@@ -99,22 +99,22 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class Session:
-    """Processes the keys that a person presses on the terminal.
+    """Process the keys that a person presses on the terminal.
 
     Parameters
     ----------
     board : Board
     requests : queue of str
-        Receives the requests of the keys.
+        Queue that gets the requests of the keys.
     keys : callable
-        Returns the keys that were pressed since the last call.
+        Function that returns the keys pressed since its last call.
 
     Attributes
     ----------
     is_over : bool
         Whether the person has ended the program.
     shows_code : bool
-        Whether the QR code of the page's address is displayed in place of the view.
+        Whether the QR code of the page's address replaces the view.
     """
 
     def __init__(
@@ -128,15 +128,16 @@ class Session:
         self._board = board
         self._requests = requests
         self._keys = keys
-        # Request that waits for a second press of its key, and the end of the wait (steady, s).
+        # Request that waits for a second press of its key.
         self._unconfirmed = ""
+        # End of this wait (steady time, s).
         self._confirm_until_s = 0.0
 
     def view(self) -> View:
         """Process the pressed keys and return the view."""
         now_s = time.monotonic()
         for key in self._keys():
-            # Ctrl-C and Ctrl-D end the program, too.
+            # Ctrl-C and Ctrl-D also end the program.
             if key in ("q", "\x03", "\x04"):
                 self.is_over = True
             elif key == "p":
@@ -166,9 +167,9 @@ class Session:
 def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
     """Yield a function that displays a view.
 
-    The arguments of the function are a View, and whether to display the QR code of the page's
-    address in its place. On a terminal, the view is on the whole screen. A file or a pipe receives
-    lines; a line that differs from one of the last view only in numbers is not repeated.
+    Its arguments are a View, and whether to display the QR code of the page's address instead. On a
+    terminal, the view fills the screen. A file or a pipe receives lines; a line that differs from
+    one of the last view only in numbers is not repeated.
     """
     from rich.live import Live
     from rich.text import Text
@@ -204,7 +205,7 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
             if content == displayed:
                 return
             if code and shows_code:
-                # These colours are readable on light terminals, too.
+                # These colours are readable on light terminals as well.
                 live.update(
                     Text.from_ansi(code, style="bright_white on black"),
                     refresh=True,
@@ -232,9 +233,9 @@ def qr_code(address: str) -> str:
 
 @contextlib.contextmanager
 def _keyboard() -> Iterator[Callable[[], str]]:
-    """Yield a function that returns the keys that were pressed since its last call.
+    """Yield a function that returns the keys pressed since its last call.
 
-    Keys are read at once, without Enter, and are not displayed. If standard input or output is no
+    Keys are read at once, without Enter, and not displayed. If standard input or output is not a
     terminal, the function returns an empty text.
     """
     if not (sys.stdin.isatty() and sys.stdout.isatty()):

@@ -1,4 +1,4 @@
-"""Connection of ``watch`` to the nodes: receives their states and sends requests to them."""
+"""Connection of ``watch`` to the nodes: it receives their states and sends requests."""
 
 import os
 import time
@@ -24,7 +24,7 @@ from hand_eye_calib.online.ros.conversions import LATCHED
 from hand_eye_calib.online.ros.outputs import PROGRESS_TOPIC
 from hand_eye_calib.online.watch.board import Board, state_of
 
-# Largest number of nodes whose state is received, and of topics with poses that are listed.
+# Largest number of nodes whose state is received, and of listed topics with poses.
 _MAX_NAMES = 20
 
 # Longest wait (s) for the answer to a request: a node answers within ANSWER_WITHIN_S.
@@ -33,7 +33,7 @@ _MAX_WAIT_S = 3.0 * ANSWER_WITHIN_S
 
 @dataclass
 class _Request:
-    """A service call without an answer yet.
+    """Service call that has no answer yet.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class _Request:
 
 
 class Watcher:
-    """Passes the states of nodes to a board; a context manager."""
+    """Pass the states of nodes to a board (context manager)."""
 
     def __init__(self, board: Board) -> None:
         self._board = board
@@ -92,7 +92,7 @@ class Watcher:
             self._follow(name)
 
     def ask(self, request: str) -> None:
-        """Send a request to the displayed node; the board receives the answer later.
+        """Send a request to the displayed node. The board gets the answer later.
 
         Parameters
         ----------
@@ -139,8 +139,8 @@ class Watcher:
     def _discover(self) -> None:
         """Subscribe to the states of new nodes, and list the topics with poses of other nodes.
 
-        Any program may publish a topic called ``progress``, so the number of nodes is limited. The
-        list helps a person whose input has no poses.
+        Any program may publish a topic called ``progress``. Therefore the number of nodes is
+        limited. The list of topics is for a person whose input has no poses.
         """
         topics = self._node.get_topic_names_and_types()
         for topic, types in topics:
@@ -188,13 +188,13 @@ class Watcher:
         return f"{topic} ({', '.join(texts)})"
 
     def _take(self, name: str, message: String) -> None:
-        """Pass the state of a node on to the board, unless it names another node."""
+        """Pass the state of a node to the board, unless the state names another node."""
         state = state_of(message.data)
         if state is not None and state.node == name:
             self._board.take(state, time.monotonic())
 
     def _follow(self, name: str) -> None:
-        """Call the service of a request if it is available now; pass an answer on to the board."""
+        """Call the service of a request if it is available now. Pass its answer to the board."""
         request = self._requests[name]
         if request.future is None and request.client.service_is_ready():
             request.future = request.client.call_async(request.message)
@@ -213,7 +213,7 @@ class Watcher:
             self._end(name, False, f"no answer within {_MAX_WAIT_S:.0f} s")
 
     def _end(self, name: str, is_good: bool, text: str) -> None:
-        """Remove a request, and pass its answer on to the board."""
+        """Remove a request, and pass its answer to the board."""
         self._node.destroy_client(self._requests.pop(name).client)
         self._board.answer(
             name, is_good, printable(text) or "done", time.monotonic()

@@ -34,8 +34,7 @@ _ON_A_VEHICLE = {
     "yaw": "turn",
 }
 
-# Largest share of the bar of an axis that is not within its target. A bar that rounds to full
-# would contradict "go on".
+# Largest share of the bar for an axis outside its target. A full bar would contradict "go on".
 _LARGEST_OUTSIDE = 0.99
 
 
@@ -58,7 +57,8 @@ def bar_of(
         sigma += ", typed in" if _has_prior(row) else f" of {target}"
     else:
         tone = Tone.UNKNOWN
-        # The time left is 0 without a standard deviation: these streams never observe the axis.
+        # If the standard deviation is unknown and the time left is 0, these streams never observe
+        # the axis.
         is_out_of_reach = math.isfinite(row.seconds_left)
         word = "out of reach" if is_out_of_reach else "not seen yet"
         sigma = "" if is_out_of_reach else f"wanted: {target}"
@@ -71,12 +71,12 @@ def bar_of(
 
 
 def _has_prior(row: AxisProgress) -> bool:
-    """Whether an axis has a prior: no time is left, although the target is not reached."""
+    """Return whether an axis has a prior: no time is left, although the target is not reached."""
     return row.seconds_left == 0 and row.target < row.sigma < math.inf
 
 
 def _share_of(row: AxisProgress) -> float:
-    """Return the information of an axis (1 / variance) as a share of what the target needs."""
+    """Return the information on an axis (1 / variance) as a share of the required information."""
     if row.sigma <= row.target or _has_prior(row):
         return 1.0
     return min((row.target / row.sigma) ** 2, _LARGEST_OUTSIDE)
@@ -93,7 +93,7 @@ def _difference(axis: str, session: ProgressState) -> str:
 def _progress_in_words(
     row: AxisProgress, session: ProgressState, axis: str
 ) -> tuple[Tone, str]:
-    """Return tone and word of an axis that has a standard deviation."""
+    """Return tone and progress in words for an axis with a standard deviation."""
     if row.seconds_left == 0:
         return Tone.GOOD, "enough"
     will_fail = session.progress.will_not_get_there
@@ -107,7 +107,7 @@ def _progress_in_words(
 
 
 def pose_values(result: ResultState) -> Iterator[tuple[str, str]]:
-    """Yield each axis of the printed pose with its value and standard deviation."""
+    """Yield the axes of the printed pose with values and standard deviations."""
     for axis in AXES:
         value = result.pose.get(axis)
         sigma = result.pose_sigma.get(axis)
@@ -125,8 +125,8 @@ def pose_values(result: ResultState) -> Iterator[tuple[str, str]]:
 def mount_line(axis: str, mount: MountState) -> Line:
     """Return the line of one axis of a monitored mount.
 
-    The text is the shift of the axis, or the smallest shift that ten minutes of motion would
-    detect.
+    The text has the shift along or about the axis, or the smallest shift that ten minutes of motion
+    would detect.
     """
     key = AXIS_KEYS[axis]
     shift = mount.shift.get(key) or 0.0
@@ -134,7 +134,7 @@ def mount_line(axis: str, mount: MountState) -> Line:
     visible = mount.visible_10min.get(key)
     tone = Tone.UNKNOWN
     text = "cannot be watched with this motion"
-    # An axis has moved if noise seldom makes the largest of six shifts as large.
+    # An axis has moved if noise seldom causes a shift of this size in the largest of six axes.
     if abs(shift) > LARGEST_OF_SIX * sigma:
         tone = Tone.BAD
         text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"

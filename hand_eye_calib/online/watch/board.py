@@ -1,7 +1,7 @@
 """Convert the state of a node into what ``watch`` displays: words, signs and bars.
 
-A :class:`Board` stores the newest state of a node and makes a :class:`View`. This module does not
-depend on ROS, a terminal or a browser.
+A :class:`Board` stores the newest state of a node and makes a :class:`View` from it. This module
+does not depend on ROS, a terminal or a browser.
 """
 
 import json
@@ -36,13 +36,13 @@ from hand_eye_calib.online.watch.headline import (
 )
 from hand_eye_calib.online.watch.view import AxisTexts, Line, Texts, Tone, View
 
-# A node is silent if its newest state is older than this (s): three reports are missing.
+# A node is silent if its newest state is older than this (s), which is three missing reports.
 _SILENT_AFTER_S = 3.5 * REPORT_PERIOD_S
 
-# Age (s) of a result from which the age is displayed.
+# Smallest displayed age (s) of a result.
 _MIN_AGE_S = 30.0
 
-# Time (s) for which the answer to a button is displayed.
+# Time (s) for which the answer to a button remains displayed.
 _ANSWER_FOR_S = 20.0
 
 # Tone of each level, verdict, verdict of a comparison, and state of a broadcast.
@@ -55,13 +55,13 @@ _TONES: dict[object, Tone] = {
     Broadcast.WAITING: Tone.BUSY,
 }
 
-# States of a broadcast in words, where these differ from the values.
+# States of a broadcast in words, if they differ from the values.
 _BROADCASTS = {Broadcast.ON: "yes, as a static transform"}
 
-# The reason of the solver is displayed if no newest result explains the state.
+# The board displays the solver's reason in these states, because no newest result explains them.
 _WITHOUT_RESULT = (Standing.NONE, Standing.OUTDATED)
 
-# Units of the values that a person types without one.
+# Units of typed values without a unit.
 _TYPED_UNITS = {axis: "deg" if axis in ROTATIONS else "m" for axis in AXES}
 
 
@@ -71,8 +71,8 @@ class Board:
     Parameters
     ----------
     wanted : str
-        Fully qualified name of the node. If empty, the first node that sends a state is displayed,
-        until it is silent and another node sends a state.
+        Fully qualified name of the node. If empty, the first node that sends a state is displayed.
+        When it is silent and another node sends a state, the display changes to this node.
 
     Attributes
     ----------
@@ -83,11 +83,11 @@ class Board:
     def __init__(self, wanted: str = "") -> None:
         self.topics: Texts = ()
         self._wanted = wanted
-        # State and answer, each with its time (s). Both are in one tuple, which is replaced as a
-        # whole, so that no thread reads a state with the time of another state.
+        # State and answer, each with its time (s). Each pair is one tuple and replaced as a whole,
+        # so that no thread combines a state with another time.
         self._newest: tuple[NodeState, float] | None = None
         self._answer: tuple[Line, float] | None = None
-        # Node and start (ns) of the alarm that a person has acknowledged.
+        # Acknowledged alarm: its node and its start (ns).
         self._acknowledged: tuple[str, int | None] | None = None
 
     @property
@@ -110,7 +110,7 @@ class Board:
     def take(self, state: NodeState, now_s: float) -> None:
         """Store a state; ignore it if another node is displayed.
 
-        ``now_s`` is the time (s) at which the state was received, on a steady clock.
+        ``now_s`` is the time (s) on a steady clock at which the state was received.
         """
         is_silent = (
             not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
@@ -122,18 +122,18 @@ class Board:
     def answer(
         self, request: str, good: bool | None, text: str, now_s: float
     ) -> None:
-        """Store the answer to a request; ``good`` is None until the answer arrives."""
+        """Store the answer to a request. ``good`` is None until the answer arrives."""
         tones = {None: Tone.BUSY, True: Tone.GOOD, False: Tone.ACT}
         self._answer = Line(tones[good], request, text), now_s
 
     def acknowledge(self) -> None:
-        """Display the present alarm of the mount as acknowledged, until another alarm begins."""
+        """Mark the present alarm of the mount as acknowledged, until another alarm begins."""
         self._acknowledged = (
             _alarm_of(self._newest[0]) if self._newest else None
         )
 
     def view(self, now_s: float) -> View:
-        """Return what to display at a time ``now_s`` (s), on the clock of :meth:`take`."""
+        """Return the view at a time ``now_s`` (s), on the clock of :meth:`take`."""
         if self._newest is None:
             name = self._wanted or "a calibrator"
             text = f"No message from {name} yet. Is the node running, on the same ROS domain and "
@@ -159,17 +159,17 @@ class Board:
 
 
 def _alarm_of(state: NodeState) -> tuple[str, int | None]:
-    """Return node and start (ns) of an alarm of the mount: they identify the alarm."""
+    """Return node and start (ns) of an alarm of the mount. They identify the alarm."""
     return state.node, state.mount.since_ns if state.mount else None
 
 
 def _lacks_messages(state: NodeState) -> bool:
-    """Whether an input has no message yet: its topic may have another name."""
+    """Return whether an input has no message yet; its topic may have another name."""
     return any(stream.messages == 0 for stream in state.inputs.values())
 
 
 def _priors_of(state: NodeState) -> AxisTexts:
-    """Return the axes that have a prior, with the priors as the user has typed them."""
+    """Return the axes with a prior, and the priors as typed by the user."""
     if state.extrinsic is None:
         return ()
     priors = state.extrinsic.priors
@@ -209,7 +209,7 @@ def _view(state: NodeState, silent_s: float) -> View:
 
 
 def _with_result(view: View, state: NodeState) -> View:
-    """Add the result to the view of a node that calibrates; a refuted result has no pose."""
+    """Add the result to the view of a calibrating node. A refuted result has no pose."""
     view = replace(view, result=tuple(_result(state, view.word)))
     if result := state.result:
         view = replace(view, reasons=result.reasons)
@@ -238,7 +238,7 @@ def _with_mount(view: View, mount: MountState) -> View:
 
 
 def _buttons(state: NodeState, asked: str) -> Texts:
-    """Return the possible requests to a node that calibrates, the recommended one first.
+    """Return the possible requests to a calibrating node, the recommended request first.
 
     ``asked`` is the request that the headline recommends; empty if there is none.
     """
@@ -253,10 +253,10 @@ def _buttons(state: NodeState, asked: str) -> Texts:
 
 
 def _axes_by_hand(state: NodeState) -> Texts:
-    """Return axes whose prior a person may set, correct or remove, the most important first.
+    """Return axes whose prior a person may set, correct or remove, in order of importance.
 
-    These are the axes whose prior contradicts the motion, the axes that the present motion cannot
-    determine, and all other axes with a prior.
+    The order is: axes whose prior contradicts the motion, axes that the present motion cannot
+    determine, and other axes with a prior.
     """
     extrinsic = state.extrinsic
     if extrinsic is None or state.progress is None:
@@ -276,7 +276,7 @@ def _axes_by_hand(state: NodeState) -> Texts:
 def _facts(state: NodeState, is_old: bool) -> str:
     """Return path length, duration of motion and age of the result; empty without poses.
 
-    The age matters while solves take long, and does not while the session is paused.
+    The age is of interest while solves take long, but not while the session is paused.
     """
     extrinsic = state.extrinsic
     if extrinsic is None or not extrinsic.n_poses:
@@ -297,7 +297,7 @@ def _facts(state: NodeState, is_old: bool) -> str:
 def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
     """Yield a line for each input, for the stream checks and for the journal.
 
-    A state that is old has no tones: its conditions may have changed.
+    Lines of an old state have no tones, because conditions may have changed.
     """
     for name, part in state.parts():
         has_problem = part.level is not Level.OK and part.text
@@ -319,11 +319,11 @@ def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
 
 def _tone_of(part: Part) -> Tone:
     """Return the tone of the line of an input, of the checks or of the journal."""
-    # Before the first check, the level is WARN, but a person need not act.
+    # Before the first check the level is WARN, but nobody needs to act.
     if isinstance(part, ChecksState) and part.age_s is None:
         return Tone.BUSY
     tone = _TONES[part.level]
-    # A robot that is parked has no poses, and a person need not act.
+    # A parked robot has no poses, but nobody needs to act.
     if isinstance(part, InputState) and part.is_paused and tone is Tone.GOOD:
         return Tone.BUSY
     return tone
@@ -332,7 +332,7 @@ def _tone_of(part: Part) -> Tone:
 def _result(state: NodeState, word: str) -> Iterator[Line]:
     """Yield the lines of the result: verdict, warnings, priors, comparison, broadcast and files.
 
-    ``word`` is the status on the board. At the end, lines with the evidence follow the warnings.
+    ``word`` is the status on the board. At the end, warnings are followed by lines with evidence.
     """
     result = state.result
     verdict = result.verdict if result else "no result yet"
@@ -389,12 +389,12 @@ def _broadcast(extrinsic: ExtrinsicState, has_ended: bool) -> Line:
 def state_of(text: str) -> NodeState | None:
     """Return the state of a node from its JSON, without control characters.
 
-    Any program may publish on the topic. So None is returned for a text that is no state, for the
-    state of another version, and for a state whose values cannot be displayed.
+    Any program may publish on the topic. The result is None if the text is no state, is the state
+    of another version, or has values that cannot be displayed.
     """
     try:
         state = from_plain(NodeState, _printable(json.loads(text)))
-        # Make a view as a trial: it raises an error for values that cannot be displayed.
+        # Make a view as a trial. It raises an error for values that cannot be displayed.
         _view(state, 0.0)
     except (
         TypeError,

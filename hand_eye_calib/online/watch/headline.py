@@ -1,7 +1,7 @@
-"""The headline of a node: its most important fact, in a word and a sentence.
+"""Headline of a node: its most important fact, as a word and a sentence.
 
-:func:`headline_of` is the only place that decides what a person at the machine should do first. The
-page and the terminal of ``watch``, the topics and the log contain the headline that it returns.
+:func:`headline_of` alone decides what a person at the machine should do first. The page and the
+terminal of ``watch``, the topics and the log contain its headline.
 """
 
 import math
@@ -38,7 +38,7 @@ from hand_eye_calib.online.live.state import (
 )
 from hand_eye_calib.online.watch.view import Tone
 
-# Words of headlines with which certain buttons are displayed.
+# Words of headlines that certain buttons depend on.
 MOVED = "MOUNT MOVED"
 CHANGE_MOTION = "CHANGE THE MOTION"
 CHANGE_TARGET = "CHANGE THE TARGET"
@@ -50,7 +50,7 @@ _ACKNOWLEDGE = "Check it, then recalibrate or acknowledge."
 
 
 class Headline(NamedTuple):
-    """The most important fact about a node.
+    """Most important fact about a node.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class Headline(NamedTuple):
         One or two words in capitals.
     sentence : str
     advice : str
-        What to do; empty if the sentence contains it.
+        Next action; empty if the sentence contains it.
     request : str
-        The request of ``view.KEYS`` that the person should send; empty if there is none.
+        Recommended request of ``view.KEYS``; empty if there is none.
     """
 
     tone: Tone
@@ -79,7 +79,7 @@ class Headline(NamedTuple):
 def headline_of(state: NodeState, silent_s: float = 0.0) -> Headline:
     """Return the headline of a node.
 
-    ``silent_s`` is the time (s) since the last message of a node that is silent, otherwise 0.
+    ``silent_s`` is the time (s) since the last message of a silent node, and 0 for other nodes.
     """
     if state.has_ended:
         return _end(state)
@@ -89,7 +89,7 @@ def headline_of(state: NodeState, silent_s: float = 0.0) -> Headline:
 
 
 def _alarm(state: NodeState) -> Headline | None:
-    """Return the gravest condition that requires a person; None if there is none."""
+    """Return the gravest condition on which a person must act, or None."""
     for condition in _conditions(state):
         part = condition.part
         if part is not None and part.level is condition.level:
@@ -108,7 +108,7 @@ def _alarm(state: NodeState) -> Headline | None:
 
 
 class _Condition(NamedTuple):
-    """A condition of a node, which it is in if a part of the node has a level.
+    """Condition of a node. The node is in this condition if ``part`` has the level ``level``.
 
     Attributes
     ----------
@@ -117,9 +117,9 @@ class _Condition(NamedTuple):
     level : Level
     part : Part or None
     text : str
-        Text of the headline. Default: the text of the part.
+        Text of the headline; by default the text of the part.
     otherwise : str
-        Text of the headline if the first text is too long.
+        Text of the headline if ``text`` is too long.
     """
 
     tone: Tone
@@ -133,8 +133,8 @@ class _Condition(NamedTuple):
 
 
 def _conditions(state: NodeState) -> Iterator[_Condition]:
-    """Yield conditions that require a person, the gravest first."""
-    # The inputs of further child sensors are displayed, but do not become a headline.
+    """Yield the conditions on which a person must act, the gravest first."""
+    # Inputs of further child sensors are displayed, but never in the headline.
     inputs = [
         stream
         for name, stream in state.inputs.items()
@@ -198,7 +198,7 @@ def _conditions(state: NodeState) -> Iterator[_Condition]:
 
 
 def _of_input(stream: InputState, state: NodeState) -> _Condition:
-    """Return the condition of an input that has no poses, or unsuitable ones."""
+    """Return the condition of an input without poses, or with unsuitable poses."""
     is_paused = stream.is_paused and state.progress is not None
     return _Condition(
         Tone.ACT,
@@ -211,7 +211,7 @@ def _of_input(stream: InputState, state: NodeState) -> _Condition:
 
 
 def _of_checks(checks: ChecksState) -> _Condition:
-    """Return the condition that the streams have a fault."""
+    """Return the condition of faulty streams."""
     return _Condition(
         Tone.ACT,
         CHECK_STREAMS,
@@ -227,7 +227,7 @@ def _of_checks(checks: ChecksState) -> _Condition:
 
 
 def _is_saved(state: NodeState) -> bool:
-    """Whether the final result is saved, so that a crash loses nothing."""
+    """Return whether the final result is saved, so that a crash loses nothing."""
     is_done = state.progress is not None and state.progress.progress.done
     return is_done and state.saved is not None
 
@@ -260,9 +260,9 @@ def _activity(state: NodeState) -> Headline:
 def _under_way(
     tone: Tone, state: NodeState, session: ProgressState
 ) -> Headline:
-    """Return the headline of a session that receives poses and has not reached its goal."""
+    """Return the headline of a session with poses that has not reached its goal."""
     sentence = _sentence(session.text)
-    # Until the next result, neither bars nor advice change, whatever the person does.
+    # Before the next result, neither bars nor advice change.
     slow = state.extrinsic.slow if state.extrinsic else ""
     if state.result is None:
         has_moved = (
@@ -287,7 +287,7 @@ def _monitoring(mount: MountState) -> Headline:
 
 
 def _pause(tone: Tone, state: NodeState, sentence: str) -> Headline:
-    """Return the headline of a session without new poses; ``sentence`` if the inputs rest."""
+    """Return the headline of a session without new poses: ``sentence`` if the inputs are silent."""
     paused = {
         name: stream
         for name, stream in state.inputs.items()
@@ -304,8 +304,8 @@ def _pause(tone: Tone, state: NodeState, sentence: str) -> Headline:
 def _at_goal(state: NodeState, session: ProgressState) -> Headline:
     """Return the headline of a session that has reached its goal.
 
-    The sentence states how far the sensor has moved against the installed transform. Otherwise it
-    states the precision or, if the verdict is not ``USE``, the verdict with its gravest reason.
+    If the sensor has moved, the sentence is the displacement from the installed transform.
+    Otherwise it is the verdict with its gravest reason or, for the verdict ``USE``, the precision.
     """
     result = state.result
     sentence = _sentence(session.progress.precision)
@@ -337,8 +337,8 @@ def _caution(result: ResultState) -> str:
 def _displacement(difference: Difference) -> str:
     """Return distance and angle by which the moved axes differ from the installed transform.
 
-    The bars contain the change of each axis. If no single axis has moved, all axes that are
-    determined count.
+    The bars contain the change of each axis. If no single axis has moved, all determined axes are
+    included.
     """
     known = [
         key for key, row in difference.axes.items() if math.isfinite(row.sigma)
@@ -357,7 +357,7 @@ def _displacement(difference: Difference) -> str:
 
 
 def _silence(state: NodeState, silent_s: float) -> Headline:
-    """Return the headline of a node that no longer sends its state."""
+    """Return the headline of a node that no longer sends states."""
     text = (
         f"No message from the node for {silent_s:.0f} s. Wait if the computer is busy. "
         "If the node has died, start it again"
@@ -400,7 +400,7 @@ def _end(state: NodeState) -> Headline:
 
 
 def typeset(text: str) -> str:
-    """Return a text with the sign ± in place of +/-."""
+    """Return a text with the sign ± instead of +/-."""
     return text.replace("+/-", "±")
 
 

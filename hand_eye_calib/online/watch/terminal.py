@@ -16,21 +16,21 @@ _STYLES = {
     Tone.UNKNOWN: "bold magenta",
 }
 
-# Length of a progress bar (columns).
+# Length of a progress bar, in columns.
 _BAR_LENGTH = 16
 
-# Smallest width (columns) of a terminal on which the last column of the bars is displayed.
+# Smallest width of a terminal (columns) with the last column of the bars.
 _MIN_WIDTH = 76
 
 # Largest number of reasons that are displayed.
 _MAX_REASONS = 3
 
-# Labels of requests, where they differ from the names of the requests.
+# Labels of requests, if they differ from their names.
 _LABELS = {"forget": "remove typed values"}
 
 
 def screen(view: View, width: int, footer: str = "") -> RenderableType:
-    """Return the whole view for a terminal, the most important content first.
+    """Return the view for a terminal, with the most important content first.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
 
 
 def lines(view: View) -> list[str]:
-    """Return the headline and the answer to the last button, as lines for a file or a pipe."""
+    """Return the headline and the answer to the last button as lines, for a file or a pipe."""
     answers = [
         f"{line.tone.value} {line.name}: {line.text}" for line in view.answer
     ]
@@ -91,7 +91,7 @@ def _pose(view: View) -> Table:
 
 
 def _bars(view: View, width: int) -> Table:
-    """Return a table with a row for each axis; the last column needs a wide terminal."""
+    """Return a table with a row per axis. The last column needs a wide terminal."""
     table = Table.grid(padding=(0, 1))
     for bar in view.bars:
         style = _STYLES[bar.tone]

@@ -1,10 +1,10 @@
-"""The content that ``watch`` displays of a node, on a terminal or in a browser."""
+"""Content that ``watch`` displays about a node, on a terminal or in a browser."""
 
 from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
-# Requests that a person can send to the node, and the key of each request on a terminal.
+# Requests that a person can send to the node, with their keys on a terminal.
 KEYS = {
     "solve": "s",
     "save": "w",
@@ -16,7 +16,7 @@ KEYS = {
 
 
 class Tone(Enum):
-    """Severity, with its sign. The sign is for people who cannot distinguish the colours."""
+    """Severity with its sign. The sign is for people who cannot distinguish the colours."""
 
     GOOD = "✓"
     BUSY = "▶"
@@ -47,16 +47,16 @@ class Bar:
     Attributes
     ----------
     name : str
-        The axis, such as "about z".
+        Name of the axis, such as "about z".
     meaning : str
         Meaning of the axis on a vehicle, such as "turn"; empty if the parent does not move like a
         vehicle.
     share : float
-        Length of the bar, 0 to 1: present information as a share of what the target needs. The
-        information is the inverse of the variance.
+        Length of the bar, 0 to 1: the information so far, divided by the information that the
+        target requires. Information is the inverse of the variance.
     tone : Tone
     word : str
-        Progress in words, such as "enough". The only time left is in the headline.
+        Progress in words, such as "enough". The time left is only in the headline.
     sigma : str
         Standard deviation and target, such as "± 0.065 deg of 0.3 deg".
     difference : str
@@ -74,7 +74,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class View:
-    """Everything that is displayed of a node.
+    """All displayed content about a node.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class View:
     tone, word, sentence
         Severity of the headline, its one or two words in capitals, and its sentence.
     advice : str
-        What to do; empty if the sentence contains it.
+        Next action; empty if the sentence contains it.
     facts : str
         Amount of motion, and age of the result.
     title : str
@@ -105,11 +105,11 @@ class View:
     buttons : tuple of str
         Requests that are possible now, the recommended request first.
     asked : str
-        The request that the headline asks for; empty if there is none.
+        Request that the headline recommends; empty if there is none.
     by_hand : tuple of str
-        Axes whose prior a person may set, correct or remove, the most important first.
+        Axes whose prior a person may set, correct or remove, in order of importance.
     priors : tuple of (str, str)
-        Axes with a prior, and the priors as the user has typed them.
+        Axes with a prior, and the priors as typed by the user.
     saved_in : str
         Directory of the saved files; empty if nothing is saved.
     answer : tuple of Line

@@ -1,8 +1,8 @@
 """Serve a view as a page for browsers. The page loads nothing from the internet.
 
 The server sends the view as server-sent events. An event is a fragment of HTML that replaces the
-last fragment. The buttons of the page send requests to the server. Every request needs the key in
-the address of the page, so that other pages in the same browser cannot use the server.
+previous fragment. The buttons of the page send requests to the server. Every request needs the key
+in the address of the page, so other pages in the same browser cannot use the server.
 """
 
 import contextlib
@@ -29,19 +29,19 @@ from hand_eye_calib.online.live.state import REPORT_PERIOD_S
 from hand_eye_calib.online.watch.board import Board
 from hand_eye_calib.online.watch.view import KEYS, Bar, Line, Tone, View
 
-# Period (s) at which the server compares the view with the last view it has sent.
+# Period (s) at which the server compares the view with the last sent view.
 _PERIOD_S = 0.25
 
-# Time (s) after which a browser that accepts no data is disconnected.
+# A browser that accepts no data for this time (s) is disconnected.
 _TIMEOUT_S = 10.0
 
-# Files of the page that are sent without the key. A page cannot add the key to these addresses.
+# Files of the page that need no key. A page cannot add the key to their addresses.
 _STYLE_AND_SCRIPT = ("page.css", "page.js")
 _FOLDER = files("hand_eye_calib.online.watch").joinpath("page")
-# Sketch of a vehicle with the names of its axes. It is drawn from the left, so its y axis points
-# towards the reader.
+# Sketch of a vehicle with the names of its axes. The vehicle is seen from its left, so its y axis
+# points towards the reader.
 _SKETCH = _FOLDER.joinpath("sketch.svg").read_text(encoding="utf-8")
-# Advice on options in a reason, which ends the reason: the form of the page replaces the options.
+# Advice about options at the end of a reason. On the page, the form replaces it.
 _PRIOR_ADVICE = re.compile("and give (a prior|priors), such as [^<]*")
 # Files of a saved result to which the page links.
 SAVED = ("report.html", "extrinsic.yaml")
@@ -65,8 +65,8 @@ _POLICY_OF_SAVED = (
 def _user_key() -> str:
     """Return the key of this user.
 
-    The key is stored in a file, so that it is the same at the next start and an open page can
-    reconnect. If no file can be stored that only this user can read, the key is a new one.
+    The key is stored in a file. After a restart it is the same, so that an open page can reconnect.
+    If no file can be stored that only this user can read, a new key is made.
     """
     new_key = secrets.token_urlsafe(6)
     with contextlib.suppress(OSError, RuntimeError, ValueError):
@@ -92,16 +92,17 @@ def _user_key() -> str:
 
 
 class WebServer(ThreadingHTTPServer):
-    """Serves the view in threads of its own, until :meth:`stop` is called.
+    """Serve the view in separate threads until :meth:`stop` is called.
 
     Parameters
     ----------
     board : Board
     ask : callable
-        Called in another thread with a request of ``view.KEYS``, or with a parameter and its value
-        such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
+        Function that is called in another thread with a request of ``view.KEYS``, or with a
+        parameter and its value such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
     address : (str, int)
-        Host and port. An empty host means all addresses of the computer, port 0 any free port.
+        Host and port. An empty host stands for all addresses of the computer, and port 0 for any
+        free port.
 
     Raises
     ------
@@ -141,8 +142,8 @@ class WebServer(ThreadingHTTPServer):
         probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         # connect() raises an error on a computer without a network.
         with probe, contextlib.suppress(OSError):
-            # For UDP, connect() sends nothing: it only selects the network interface. 192.0.2.1 is
-            # an address that is reserved for documentation (RFC 5737).
+            # For UDP, connect() sends nothing; it only selects the network interface. 192.0.2.1 is
+            # reserved for documentation (RFC 5737).
             probe.connect(("192.0.2.1", 9))
             if not self._host:
                 hosts.insert(0, str(probe.getsockname()[0]))
@@ -162,7 +163,7 @@ class WebServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Answers the requests of one connection."""
+    """Answer the requests of one connection."""
 
     server: WebServer
     protocol_version = "HTTP/1.1"
@@ -197,7 +198,7 @@ class _Handler(BaseHTTPRequestHandler):
         if request == "forget" and axis in AXIS_UNITS:
             request = f"prior.{axis}:="
         elif request == "prior" and axis in AXIS_UNITS:
-            # The node refuses a value that is no number.
+            # The node refuses a value that is not a number.
             prior = prior_as_typed(
                 axis, self._argument("value"), self._argument("sigma")
             )
@@ -214,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _saved(self, name: str) -> bytes:
         """Return a file of the saved result; empty if there is none, or if it is a symbolic link.
 
-        The node may run on another computer, so the file may be absent here.
+        If the node runs on another computer, the file may be missing here.
         """
         folder = self.server.board.view(time.monotonic()).saved_in
         file = Path(folder, name)
@@ -233,7 +234,7 @@ class _Handler(BaseHTTPRequestHandler):
         return parse_qs(urlsplit(self.path).query).get(name, [""])[-1]
 
     def _has_key(self) -> bool:
-        """Whether the address has the right key; the comparison takes the same time for any key."""
+        """Return whether the address has the right key, in the same time for any key."""
         key = self._argument("key").encode(errors="replace")
         return hmac.compare_digest(key, self.server.key.encode())
 
@@ -276,7 +277,7 @@ class _Handler(BaseHTTPRequestHandler):
         while not self.server.stopping.wait(_PERIOD_S if last_html else 0.0):
             now_s = time.monotonic()
             view = self.server.board.view(now_s)
-            # Path.is_file would raise an error for a name that is too long.
+            # Path.is_file raises an error for a name that is too long.
             files = [
                 name
                 for name in SAVED
@@ -298,8 +299,8 @@ class _Handler(BaseHTTPRequestHandler):
 def fragment(view: View, files: Sequence[str] = ()) -> str:
     """Return the HTML of a view, without buttons and links.
 
-    Buttons and links are fixed parts of the page, because a button that is replaced while a finger
-    is on it does not react. Attributes of the first element list the buttons and links to display.
+    Buttons and links are fixed parts of the page: a button that is replaced under a finger does not
+    react. Attributes of the first element list the buttons and links to display.
 
     Parameters
     ----------
