@@ -32,6 +32,7 @@ from hand_eye_calib.core.results.document import (
 from hand_eye_calib.core.results.parts import all_parts, part
 from hand_eye_calib.core.results.records import ROTATIONS, TRANSLATIONS
 from hand_eye_calib.core.results.verdict import Judged
+from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.formats.files import (
     open_regular,
     path_of,
@@ -299,6 +300,13 @@ def recording_of(path: str | Path) -> frozenset[str]:
     )
 
 
+def _bag_instead(path: Path) -> InputError:
+    """Return the error about a bag in place of a result."""
+    return InputError(
+        f"{path} is a bag, not a saved result: calibrate {path} --out DIR saves a result in DIR"
+    )
+
+
 def load_result(path: str | Path) -> Calibration:
     """Read a calibration that :func:`save_result` wrote: the file, or its directory.
 
@@ -323,10 +331,14 @@ def load_result(path: str | Path) -> Calibration:
                 f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}"
             )
         if not (path / FILE_NAME).exists():
+            if any(map(has_suffix_of_bag, path.iterdir())):
+                raise _bag_instead(path)
             raise InputError(
                 f"{path} has no {FILE_NAME}: name the folder of a result (--out)"
             )
         path = path / FILE_NAME
+    elif has_suffix_of_bag(path) and path.exists():
+        raise _bag_instead(path)
     if path.suffix in (".urdf", ".xacro"):
         raise InputError(
             f"{path} is a robot description, not a saved result: pass it to compare RESULT --with "

@@ -326,7 +326,7 @@ def test_bars_show_the_share_of_the_information_and_the_time_left():
 @pytest.mark.parametrize(
     ("sigma", "left_s", "tone", "word", "share"),
     [
-        (INF, INF, Tone.UNKNOWN, "not seen yet", 0.0),
+        (INF, INF, Tone.UNKNOWN, "unknown yet", 0.0),
         (INF, 30.0, Tone.UNKNOWN, "out of reach", 0.0),  # as roll of an antenna
         (0.08, INF, Tone.ACT, "not enough yet", 0.0625),
         (0.018, 0.0, Tone.GOOD, "enough", 1.0),
@@ -354,7 +354,7 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
         "0.420 m ± 4 mm",
         "0.57 ± 0.57 deg",
     )
-    assert values["z"] == "? not observed"
+    assert values["z"] == "unknown"
     moved = replace(EXTRINSIC, motion_s=75.0)
     assert view_of(state(extrinsic=moved)).facts == "3 m, 75 s of motion"
     late = replace(moved, result=replace(RESULT, age_s=40.0))

@@ -244,7 +244,10 @@ def test_launch_arguments_make_targets_and_files_exist(page):
     ] == []
 
 
-def test_first_command_of_the_readme_prints_its_output(capsys):
+def test_first_command_of_the_readme_prints_its_output(
+    capsys, tmp_path, monkeypatch, no_figures
+):
+    monkeypatch.chdir(tmp_path)
     (command,) = [
         words
         for words in commands(PAGES["README.md"])
@@ -268,10 +271,11 @@ def test_commands_of_the_readme_on_samples_run(
         if "sample:" in " ".join(words)
     ]
     assert [words[1] for words in runnable[1:]] == [
+        "result",
         "sample:drive.mcap",
         "sample:arm.yaml",
     ]
-    assert [main(list(words)) for words in runnable] == [0, 0, 0]
+    assert [main(list(words)) for words in runnable] == [0, 0, 0, 0]
     assert (tmp_path / "result" / "extrinsic.yaml").exists()
 
 

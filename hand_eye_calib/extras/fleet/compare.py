@@ -32,6 +32,12 @@ examples:
 exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
 
 
+# Explanation of a column of the table.
+_SEEN_FROM = (
+    "seen from: the smallest change that would be detected in nine of ten cases"
+)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.usage = "%(prog)s [OPTION ...] RESULT ..."
@@ -87,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     comparison = compare(results, installed, distinct_names(arguments.results))
     lines = [*_lines(comparison, results[0], arguments.installed)]
     lines += wrapped(scatters_in_words(results), "", "  ")
+    lines += wrapped(_SEEN_FROM, "", "  ")
     print_result(lines, comparison if arguments.json else None)
     if not arguments.installed:
         note(*_repeated_recordings(arguments.results))

@@ -292,8 +292,25 @@ def _calibration(
         nominal_radius_m=config.nominal_radius,
         nominal_separation_m=config.nominal_separation,
     )
-    result = replace(result, findings=result.findings + _check_size(wheels))
+    result = replace(
+        result,
+        findings=result.findings + _check_size(wheels),
+        warnings=result.warnings + _note_on_identity(result),
+    )
     return result.with_part("wheels", wheels)
+
+
+def _note_on_identity(result: Calibration) -> tuple[str, ...]:
+    """Return a note if the sensor seems to be at the origin of the vehicle, with its axes."""
+    x, y = result.T_parent_child[:2, 3]
+    yaw = np.arctan2(result.T_parent_child[1, 0], result.T_parent_child[0, 0])
+    is_near = np.hypot(x, y) < result.target_translation
+    if not is_near or abs(yaw) > result.target_rotation:
+        return ()
+    return (
+        "x, y and yaw are 0 within the targets: are the poses odometry of these wheels? Then give "
+        "the poses of another sensor",
+    )
 
 
 def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:

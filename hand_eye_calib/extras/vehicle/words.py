@@ -45,7 +45,8 @@ WORDS = {
     ),
     "radius_not_nominal": FindingWords(
         "the wheel radius is {radius:.4f} m, {ratio:.3g} times the nominal {nominal:.4f} m",
-        "correct nominal_radius, or the unit of the speeds: rad/s or m/s",
+        "correct nominal_radius; or give the speeds of the wheels in rad/s or m/s, or name the "
+        "columns with their unit (left_rpm)",
         "{cause}",
         severity=Severity.WARNING,
     ),

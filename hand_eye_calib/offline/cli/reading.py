@@ -129,7 +129,7 @@ def refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
             raise ConfigError(
-                f"{path} appears twice: pass the file of each sensor"
+                f"{path} appears twice: pass the file of each sensor, a bag only once"
             )
 
 

@@ -60,7 +60,7 @@ def bar_of(
         # If the standard deviation is unknown and the time left is 0, these streams never observe
         # the axis.
         is_out_of_reach = math.isfinite(row.seconds_left)
-        word = "out of reach" if is_out_of_reach else "not seen yet"
+        word = "out of reach" if is_out_of_reach else "unknown yet"
         sigma = "" if is_out_of_reach else f"wanted: {target}"
     meaning = (
         _ON_A_VEHICLE[axis] if extrinsic and extrinsic.has_vehicle_axes else ""
@@ -112,7 +112,7 @@ def pose_values(result: ResultState) -> Iterator[tuple[str, str]]:
         value = result.pose.get(axis)
         sigma = result.pose_sigma.get(axis)
         if value is None or sigma is None:
-            yield axis, "? not observed"
+            yield axis, "unknown"
         elif axis in ROTATIONS:
             yield (
                 axis,
