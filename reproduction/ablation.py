@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import settle_scale
+from hand_eye_calib.core.alignment.scale import settle_scale
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.se3 import deviation

@@ -20,8 +20,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError, NotEnoughDataError
 from hand_eye_calib.core.base.plain import plain
+from hand_eye_calib.core.engine.attempts import check
 from hand_eye_calib.core.engine.calibrator import BufferLimits, Calibrator
-from hand_eye_calib.core.engine.run import check
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory

@@ -21,6 +21,7 @@ from hand_eye_calib.core.assessment.second_opinion import (
     second_opinions,
 )
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
 from hand_eye_calib.core.pairing.motion_pairs import motion_pairs
 from hand_eye_calib.core.solvers.robust import solve, solve_best_stride
 
@@ -201,4 +202,4 @@ def added_sigmas(answer, opinions):
     """Return the standard deviations (6,) that opinions add, along and about the parent's axes."""
     excess = excess_covariance(answer, opinions)
     rotation = answer.T_parent_child[:3, :3]
-    return se3.sigmas_in_parent(rotation, excess)
+    return sigmas_in_parent(rotation, excess)

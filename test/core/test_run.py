@@ -362,7 +362,7 @@ def test_a_given_reference_solves_nothing_else_unless_cross_checks_are_asked_for
         lambda *_, **__: solved.append("adaptive"),
     )
     monkeypatch.setattr(
-        "hand_eye_calib.core.engine.run.check",
+        "hand_eye_calib.core.engine.attempts.check",
         lambda *_: solved.append("check") or CheckResult(()),
     )
     result = hec.calibrate(

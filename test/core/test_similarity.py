@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sigmas import assert_errors_over_sigmas
 
 from hand_eye_calib.core.alignment.rate_correlation import correlate_rates
-from hand_eye_calib.core.alignment.similarity import estimate_scale
+from hand_eye_calib.core.alignment.scale import estimate_scale
 from hand_eye_calib.core.alignment.time_offset import estimate_time_offset
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import NotEnoughDataError

@@ -7,7 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import REACH, Trajectory
+from hand_eye_calib.core.geometry.interpolation import REACH
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 
 STAMPS = np.array([0, 10, 20], dtype=np.int64)
 POSES = wandering_poses(3)

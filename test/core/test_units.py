@@ -7,7 +7,7 @@ from motions import as_trajectory, child_of, disturbed, wandering_poses
 from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
-from hand_eye_calib.core.alignment.similarity import estimate_scale
+from hand_eye_calib.core.alignment.scale import estimate_scale
 from hand_eye_calib.core.checks.streams import (
     check_lengths,
     is_too_fast,

@@ -10,7 +10,7 @@ from motions import geodetic, planar_poses, walked, wandering_poses
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.common_mode import usual_speed
-from hand_eye_calib.core.engine.run import check
+from hand_eye_calib.core.engine.attempts import check
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory

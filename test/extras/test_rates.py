@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Writer
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, InputError
-from hand_eye_calib.core.engine.run import check
+from hand_eye_calib.core.engine.attempts import check
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.rates import RateIntegrator

@@ -90,10 +90,8 @@ def parsed(options):
     """The configuration that ``calibrate`` makes of its options."""
     import argparse
 
-    from hand_eye_calib.offline.cli.options import (
-        add_config_arguments,
-        options_from,
-    )
+    from hand_eye_calib.offline.cli.config_file import options_from
+    from hand_eye_calib.offline.cli.options import add_config_arguments
 
     parser = argparse.ArgumentParser()
     add_config_arguments(parser)

@@ -9,7 +9,7 @@ from result_making import calibration as made
 from result_making import dofs
 
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import (
+from hand_eye_calib.core.geometry.covariances import (
     inverse_covariance,
     sigmas_in_parent,
     sigmas_rpy,

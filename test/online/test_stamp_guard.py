@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_eye_calib.online.live.input import MIN_HELD, NEAR_NS, StampGuard
+from hand_eye_calib.online.live.stamp_guard import MIN_HELD, NEAR_NS, StampGuard
 
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -34,7 +34,7 @@ CONFINED = dict.fromkeys(ROS_LIBRARIES, ROS) | {
     "mcap": ("formats/bags/",),
     "backports": ("formats/bags/storage.py",),
     "fsspec": ("formats/remote.py",),
-    "pyulog": ("extras/sensors/foreign.py",),
+    "pyulog": ("extras/sensors/ulog.py",),
     "casadi": ("core/solvers/ipopt.py",),
     "matplotlib": PAGES,
     "pandas": ("core/results/calibration.py", "extras/fleet/together.py"),

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker
 from hand_eye_calib.core.base import config
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES, ns_of
 from hand_eye_calib.formats.bags.unpacking import MessageReader

@@ -72,7 +72,6 @@ _FINE_RANGE_S = 0.25
 # ... or, if it is longer, this number of intervals of the slower stream.
 _FINE_RANGE_INTERVALS = 2.0
 
-
 _NO_CORRELATION = Correlation()
 
 
@@ -271,17 +270,19 @@ def offset_over(
         if _is_small_step(fit.offset_s, offset_s, settled_s, negligible_s):
             before = rate
             rate = _rate(fit, pose_pairs.stamps_ns[pairs.i], before)
-            is_settled = (
-                abs(rate.used - before.used) * child.duration_s < settled_s
-            )
+            change_s = abs(rate.used - before.used) * child.duration_s
+            is_settled = change_s < settled_s
             if is_settled and (max_pairs > MAX_PAIRS or not rate.is_used):
                 break
     estimate = TimeOffset(offset_s, fit.offset_sigma_s, at.correlation, fit)
-    return (
-        replace(estimate, rate=rate)
-        if np.isfinite(rate.sigma_ppm)
-        else estimate
-    )
+    return _with_known_rate(estimate, rate)
+
+
+def _with_known_rate(offset: TimeOffset, rate: ClockRate) -> TimeOffset:
+    """Return the offset with a clock rate, if the rate was estimated."""
+    if not np.isfinite(rate.sigma_ppm):
+        return offset
+    return replace(offset, rate=rate)
 
 
 def _is_small_step(

@@ -17,8 +17,9 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, require_type
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.geometry.frames import Extrinsic
-from hand_eye_calib.core.geometry.se3 import deviation, turned, xyz_rpy
+from hand_eye_calib.core.geometry.se3 import deviation, xyz_rpy
 from hand_eye_calib.core.results.axes import target_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.context import Comparison, Difference

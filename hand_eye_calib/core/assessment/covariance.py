@@ -32,7 +32,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, jackknife_covariance
 from hand_eye_calib.core.base.stats import CHI2
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
+from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
 from hand_eye_calib.core.noise.estimator import AdaptiveSolution, ModelSolution
 from hand_eye_calib.core.noise.noise_model import WALK_ROTATION
 from hand_eye_calib.core.noise.normal import NormalEquations, multiplied

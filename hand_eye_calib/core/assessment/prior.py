@@ -25,7 +25,7 @@ from hand_eye_calib.core.assessment.covariance import (
 )
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
+from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
 from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS, TRANSLATIONS
 

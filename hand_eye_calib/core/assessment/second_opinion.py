@@ -23,6 +23,7 @@ from hand_eye_calib.core.assessment.covariance import (
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import medians
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers.robust import RobustSolution, solve_strides
 
@@ -102,6 +103,4 @@ def excess_covariance(
             )
         )
     variances = medians(np.array(excesses).T)
-    return se3.turned(
-        se3.rotation_of(answer.T_parent_child).T, np.diag(variances)
-    )
+    return turned(se3.rotation_of(answer.T_parent_child).T, np.diag(variances))

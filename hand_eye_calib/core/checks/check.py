@@ -16,7 +16,7 @@ assumption about both streams: poses or inverse poses.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +26,7 @@ from hand_eye_calib.core.alignment.rate_correlation import (
     MIN_VARIATION,
     Correlation,
 )
+from hand_eye_calib.core.alignment.scale import estimate_scale
 from hand_eye_calib.core.alignment.similarity import SimilarityFit
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.assessment.covariance import (
@@ -50,6 +51,7 @@ from hand_eye_calib.core.checks.clock_and_scale import (
     in_metres,
     own_unit,
 )
+from hand_eye_calib.core.checks.common_clock import coarse_offset, fine_offset
 from hand_eye_calib.core.checks.findings import (
     LIMITS,
     Finding,
@@ -85,12 +87,6 @@ from hand_eye_calib.core.pairing.motion_pairs import (
     PosePairs,
     pairs_over,
 )
-
-# Accuracy of the coarse clock offset of slow streams, in intervals between poses.
-_COARSE_INTERVALS = 0.5
-# Longest gap that is interpolated, in intervals between poses, if the clocks of slow streams differ
-# by more than the coarse accuracy.
-_SLOW_GAP_INTERVALS = 1.5
 
 # The smallest possible lever arm is its estimate minus this number of standard deviations.
 _LEVER_ARM_SIGMAS = 3.0
@@ -173,22 +169,18 @@ def check_streams(
     explanation = None
     offset = TimeOffset()
     if earlier and not streams.is_slow:
-        explanation, offset = _explain_by_extrinsic(
-            streams, earlier.T_parent_child
-        )
+        explanation, offset = _explain_by_extrinsic(streams, earlier)
     if not explanation:
         correlation = (correlate or original.correlate)()
         if factor := _factor_of_angles(correlation):
             return CheckResult(gravest_first([*findings, factor]))
-        streams, offset = _coarse_offset(
+        streams, offset = coarse_offset(
             original, streams, time_offset_s, correlation
         )
     aligned = streams.shifted(offset.seconds)
     frozen = check_frozen(aligned.parent, aligned.child)
     findings += frozen
-    incomplete = check_flat(aligned.parent, aligned.child)
-    incomplete = incomplete or parts.check_turned_parts(aligned.synchronised)
-    if incomplete:
+    if incomplete := _check_complete(aligned):
         return CheckResult(gravest_first([*findings, *incomplete]))
     if not explanation:
         is_frozen = _are_unusable(frozen)
@@ -220,44 +212,18 @@ def _are_unusable(findings: Sequence[Finding]) -> bool:
     return any(found.makes_unusable for found in findings)
 
 
+def _check_complete(aligned: StreamPair) -> list[Finding]:
+    """Return findings about streams that are flat, or whose parts were turned."""
+    flat = check_flat(aligned.parent, aligned.child)
+    return flat or parts.check_turned_parts(aligned.synchronised)
+
+
 def _factor_of_angles(correlation: Correlation) -> Finding | None:
     """Return the finding that all rotation angles of the child are wrong by one factor, or None."""
     if 1.0 - correlation.correlation >= HOLDS:
         return None
     ratio = correlation.ratio
     return graded("turns", "child", float(np.log(ratio)), times=ratio)
-
-
-def _coarse_offset(
-    original: StreamPair,
-    streams: StreamPair,
-    added_s: float,
-    correlation: Correlation,
-) -> tuple[StreamPair, TimeOffset]:
-    """Return the streams to compare, and the clock offset that their angular rates still have.
-
-    Parameters
-    ----------
-    original, streams : StreamPair
-        The streams before and after ``added_s`` was added to the child's stamps.
-    added_s : float
-        Time offset, s.
-    correlation : Correlation
-        Correlation of the angular rates of the original streams.
-    """
-    if streams.is_slow:
-        streams, remaining = _align_slow(
-            original, streams, added_s, correlation
-        )
-    else:
-        remaining = replace(
-            correlation, offset_s=correlation.offset_s - added_s
-        )
-    if not correlation.is_clear:
-        # A short recording may not determine the offset. The streams may still agree with
-        # ``added_s``.
-        remaining = replace(remaining, offset_s=0.0)
-    return streams, TimeOffset(remaining.offset_s, correlation=remaining)
 
 
 def _check_explained(
@@ -281,7 +247,7 @@ def _check_explained(
     arguments : _Arguments
     """
     corrected = explanation.hypothesis.undo(streams)
-    offset = _fine_offset(corrected, coarse_offset, explanation.fit)
+    offset = fine_offset(corrected, coarse_offset, explanation.fit)
     corrected = corrected.shifted(offset.seconds)
     sizes, fit = _check_sizes(
         corrected, explanation, offset.fit, arguments.scale
@@ -385,11 +351,11 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
 
 
 def _explain_by_extrinsic(
-    streams: StreamPair, X: FloatArray
+    streams: StreamPair, earlier: ExtrinsicEstimate
 ) -> tuple[Explanation | None, TimeOffset]:
     """Return the explanation without mistakes if it holds, or None, and the clock offset.
 
-    The fit starts at the extrinsic X (4, 4) of an earlier solve. The streams must clearly agree, in
+    The fit starts at the extrinsic of an earlier solve. The streams must clearly agree, in
     one unit of length and on about one clock; otherwise the explanation is None.
     """
     note_s = LIMITS["time_offset"].note
@@ -403,7 +369,7 @@ def _explain_by_extrinsic(
         streams.max_gap_s,
         # One refinement suffices if the offset is below half of the smallest reported size.
         2.0 * note_s,
-        X,
+        earlier.T_parent_child,
         HOLDS,
     )
     fit = offset.fit
@@ -422,62 +388,6 @@ def _explain_by_extrinsic(
     if explanation.findings:
         return None, TimeOffset()
     return explanation, offset
-
-
-def _fine_offset(
-    corrected: StreamPair, coarse_offset: TimeOffset, fit: SimilarityFit
-) -> TimeOffset:
-    """Return the refined clock offset of corrected streams.
-
-    ``fit`` is used if the coarse offset has no fit of its own. If a coarse offset with a fit is
-    clearly below the smallest reported size, it is not refined. Slow streams cannot be
-    interpolated: their offset is accurate to one interval between poses.
-    """
-    note_s = LIMITS["time_offset"].note
-    if (
-        coarse_offset.fit
-        and coarse_offset.largest_s(corrected.child.duration_s) < note_s
-    ):
-        return coarse_offset
-    if corrected.is_slow:
-        return TimeOffset(
-            coarse_offset.seconds,
-            corrected.interval_s,
-            coarse_offset.correlation,
-        )
-    return time_offset.refine_time_offset(
-        corrected.parent,
-        corrected.child,
-        replace(coarse_offset, fit=coarse_offset.fit or fit),
-        corrected.max_gap_s,
-        note_s,
-    )
-
-
-def _align_slow(
-    original: StreamPair,
-    shifted: StreamPair,
-    added_s: float,
-    correlation: Correlation,
-) -> tuple[StreamPair, Correlation]:
-    """Return slow streams on one clock, with the correlation at the clock offset that remains.
-
-    The poses of slow streams are too far apart to interpolate. Therefore only two pairs of streams
-    are possible: those shifted by ``added_s``, or the original streams. A pair is used if it has
-    common stamps and the coarse offset agrees.
-    """
-    for offset_s, candidate in ((added_s, shifted), (0.0, original)):
-        if len(candidate.synchronised) <= MIN_PAIRS:
-            continue
-        error_s = abs(correlation.offset_s - offset_s)
-        if (
-            error_s < _COARSE_INTERVALS * original.interval_s
-            or not correlation.is_clear
-        ):
-            return candidate, replace(correlation, offset_s=0.0)
-    remaining = replace(correlation, offset_s=correlation.offset_s - added_s)
-    max_gap_s = _SLOW_GAP_INTERVALS * original.interval_s
-    return replace(shifted, max_gap_s=max_gap_s), remaining
 
 
 def _explain_or_misread(
@@ -563,7 +473,7 @@ def _check_sizes(
         candidate for candidate in fits_of_scale if candidate.scale_sigma > 0.0
     ]
     with suppress(NotEnoughDataError):
-        fit = similarity.estimate_scale(pose_pairs, fits_of_scale)
+        fit = estimate_scale(pose_pairs, fits_of_scale)
         other_unit = (
             own_unit(streams, fit, used_scale) if fit.has_own_unit else None
         )

@@ -230,9 +230,9 @@ class _Stream:
         self.chords = self.R_end - self.R_start
         to_start = R_parent_sensor @ np.swapaxes(se3.rotation_of(start), 1, 2)
         self.rotations = to_start @ se3.rotation_of(end) @ R_parent_sensor.T
-        self.displacements_in_world = se3.translation_of(
-            end
-        ) - se3.translation_of(start)
+        start_positions = se3.translation_of(start)
+        end_positions = se3.translation_of(end)
+        self.displacements_in_world = end_positions - start_positions
         self.displacements = se3.times(
             self.from_world, self.displacements_in_world
         )
@@ -260,6 +260,21 @@ class _Stream:
     ) -> tuple[FloatArray, FloatArray]:
         """Return velocities and accelerations (N, 3) of all poses, in the stream's world."""
         return path_derivatives(se3.translation_of(self._poses), around, step_s)
+
+
+def _drift_regressors(
+    pose_pairs: PosePairs, motions: MotionPairs, child: _Stream
+) -> FloatArray:
+    """Return the regressors of velocity (m/s) and angular rate (rad/s) of the child's world."""
+    stamps_ns = pose_pairs.stamps_ns
+    durations_s = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
+    drifted = child.from_world * durations_s[:, None, None]
+    start_positions = pose_pairs.Ts_cw_c[motions.i, :3, 3]
+    middle = start_positions + 0.5 * child.displacements_in_world
+    middle = middle - middle.mean(axis=0)
+    translating = _regressors(drifted)
+    rotating = _regressors(-drifted @ se3.skew(middle), drifted)
+    return np.concatenate([translating, rotating], axis=2)
 
 
 def motion_regression(
@@ -294,42 +309,30 @@ def motion_regression(
     child_to_world = np.swapaxes(child.from_world, 1, 2)
     parent_predicted = se3.times(parent_to_world, child.displacements - arm)
     child_predicted = se3.times(child_to_world, parent.displacements + arm)
-    stamps_ns = pose_pairs.stamps_ns
-    durations_s = (stamps_ns[motions.j] - stamps_ns[motions.i]) * 1e-9
-    drifted = child.from_world * durations_s[:, None, None]
-    middle = (
-        pose_pairs.Ts_cw_c[motions.i, :3, 3]
-        + 0.5 * child.displacements_in_world
-    )
-    middle = middle - middle.mean(axis=0)
     rotations = se3.rotation_log(parent.rotations)
     axes = np.linalg.eigh(rotations.T @ rotations)[1][:, ::-1]
     turned_child = -child.from_world @ se3.skew(child.displacements_in_world)
     turned_parent = parent.from_world @ se3.skew(parent.displacements_in_world)
-    R_cw_pw = se3.nearest_rotation(
-        (child_to_world @ parent.from_world).mean(axis=0)
-    )
-    translating = _regressors(drifted)
-    rotating = _regressors(-drifted @ se3.skew(middle), drifted)
+    between_worlds = child_to_world @ parent.from_world
+    R_cw_pw = se3.nearest_rotation(between_worlds.mean(axis=0))
+    axes_child = child.from_world * child_predicted[:, None, :]
+    axes_parent = -parent.from_world * parent_predicted[:, None, :]
     groups = {
         "turned_child": _regressors(turned_child),
         "turned_parent": _regressors(turned_parent),
         "turned_both": _regressors(turned_parent + turned_child @ R_cw_pw),
-        "axes_child": _regressors(
-            child.from_world * child_predicted[:, None, :]
-        ),
-        "axes_parent": _regressors(
-            -parent.from_world * parent_predicted[:, None, :]
-        ),
-        "drift": np.concatenate([translating, rotating], axis=2),
+        "axes_child": _regressors(axes_child),
+        "axes_parent": _regressors(axes_parent),
+        "drift": _drift_regressors(pose_pairs, motions, child),
         "gain": _regressors(
-            np.zeros_like(drifted), (rotations @ axes)[:, None, :] * axes[None]
+            np.zeros_like(child.from_world),
+            (rotations @ axes)[:, None, :] * axes[None],
         ),
     }
     if moved_at_ns is not None:
-        is_after = (
-            stamps_ns[motions.i] + stamps_ns[motions.j]
-        ) // 2 >= moved_at_ns
+        stamps_ns = pose_pairs.stamps_ns
+        middle_ns = (stamps_ns[motions.i] + stamps_ns[motions.j]) // 2
+        is_after = middle_ns >= moved_at_ns
         base = _base_groups(parent, child)
         of_extrinsic = np.concatenate([base["lever"], base["rotation"]], axis=2)
         groups["moved"] = is_after[:, None, None] * of_extrinsic

@@ -22,10 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import (
-    EXPLAINED,
-    fit_similarity,
-)
+from hand_eye_calib.core.alignment.similarity import EXPLAINED, fit_similarity
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.checks.findings import (

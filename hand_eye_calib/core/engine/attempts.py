@@ -1,13 +1,15 @@
-"""Attempts: snapshots that were solved with some options, checked, and can be compared."""
+"""Attempts: snapshots that are solved with some options, checked, and compared."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from hand_eye_calib.core.base.config import defaults_of
+from hand_eye_calib.core.base.errors import HandEyeCalibError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.findings import Finding, Severity, gravest_first
+from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
@@ -25,6 +27,9 @@ STREAM_REPAIRS = (
 # A noise model fits if its misfit, the weighted squared residual per degree of freedom, is at most
 # this. The misfit is 1 if the model is right, and less if there is no noise.
 _MAX_MISFIT = 2.0
+
+# Growth of a sigma by open faults above which a result is examined again.
+_MUCH_WIDER = 1.05
 
 
 class OptionMessage(NamedTuple):
@@ -173,3 +178,42 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         paired_at=None,
         time_offset=None,
     )
+
+
+def check(
+    snapshot: Snapshot, calibration: Calibration | None = None
+) -> CheckResult:
+    """Check the streams of a snapshot, with their result if there is one."""
+    return kind_of(snapshot.config).check(snapshot, calibration)
+
+
+def with_open_errors(
+    calibration: Calibration,
+    result: CheckResult,
+    snapshot: Snapshot | None = None,
+) -> Calibration:
+    """Return the calibration whose allowance contains the faults that a check leaves open.
+
+    If sigmas grow much, the calibration is examined again with its snapshot.
+    """
+    allowance = calibration.covariance_allowance + result.open_covariance
+    wider = replace(calibration, covariance_allowance=allowance)
+    if snapshot and (wider.sigmas > _MUCH_WIDER * calibration.sigmas).any():
+        return snapshot.examined(wider)
+    return wider
+
+
+def checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
+    """Check the streams of a result, and return the attempt."""
+    result = check(snapshot, calibration)
+    wider = with_open_errors(calibration, result, snapshot)
+    return Attempt(replace(wider, findings=result.findings), snapshot, result)
+
+
+def solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
+    """Solve and check with some options changed; return None if the solve fails."""
+    try:
+        other = with_options(snapshot, options)
+        return checked(other.estimate(), other)
+    except HandEyeCalibError:
+        return None

@@ -20,7 +20,8 @@ from hand_eye_calib.core.engine import snapshot as snapshots
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.geometry import trajectory
 from hand_eye_calib.core.geometry.frames import check_pose
-from hand_eye_calib.core.geometry.trajectory import REACH, Trajectory
+from hand_eye_calib.core.geometry.interpolation import REACH
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs, slower_stream
 from hand_eye_calib.core.results.calibration import Calibration
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import SimilarityFit, settle_scale
+from hand_eye_calib.core.alignment.scale import settle_scale
+from hand_eye_calib.core.alignment.similarity import SimilarityFit
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.moved import possible_shift
@@ -47,7 +48,6 @@ from hand_eye_calib.core.results.calibration import (
 from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
-from hand_eye_calib.core.solvers.robust import Stride
 
 # Share of jumps among the increments above which there is a warning. If a tenth of the poses of
 # each trajectory jumps, a fifth of the increments are jumps.
@@ -199,6 +199,24 @@ class Solved:
         return {"scale": scale, "scale_sigma": scale_sigma}
 
 
+def _status_of(
+    solution: Any, fused: covariance.Assessment, measured: str
+) -> SolveStatus:
+    """Return the status of a solution; axes out of reach of what was measured do not count."""
+    unobservable = {
+        dof.name
+        for dof in fused.observability
+        if dof.verdict is DofVerdict.UNOBSERVABLE
+    }
+    if not solution.converged:
+        return SolveStatus.NOT_CONVERGED
+    if fused.contradictions:
+        return SolveStatus.CONTRADICTED
+    if unobservable.difference(OUT_OF_REACH.get(measured, ())):
+        return SolveStatus.UNOBSERVABLE
+    return SolveStatus.OK
+
+
 def calibration_of(
     solution: Any,
     fused: covariance.Assessment,
@@ -226,17 +244,7 @@ def calibration_of(
         Further fields of the Calibration. They replace the defaults.
     """
     dofs = fused.observability
-    out_of_reach = OUT_OF_REACH.get(fields.get("measured", "poses"), ())
-    unobservable = {
-        dof.name for dof in dofs if dof.verdict is DofVerdict.UNOBSERVABLE
-    }
-    status = SolveStatus.OK
-    if not solution.converged:
-        status = SolveStatus.NOT_CONVERGED
-    elif fused.contradictions:
-        status = SolveStatus.CONTRADICTED
-    elif unobservable.difference(out_of_reach):
-        status = SolveStatus.UNOBSERVABLE
+    measured = fields.get("measured", "poses")
     by_prior = [dof.name for dof in dofs if dof.verdict is DofVerdict.PRIOR]
     if by_prior:
         names = ", ".join(by_prior)
@@ -251,7 +259,7 @@ def calibration_of(
         T_parent_child=fused.T_parent_child,
         covariance_measured=fused.cov_parent_child_in_child,
         observability_measured=dofs,
-        status=status,
+        status=_status_of(solution, fused, measured),
         objective=solution.objective,
         n_poses=len(stamps_ns),
         n_pairs=len(residuals),
@@ -477,6 +485,38 @@ def _motion_pairs(pose_pairs: PosePairs, reference: str) -> MotionPairs:
     return pairs
 
 
+@dataclass(frozen=True)
+class _Reference:
+    """Name of a reference and, if it was chosen automatically, what its choice has shown.
+
+    ``reason`` is the reason of the choice. ``spread`` and ``warnings`` are those of
+    :func:`~hand_eye_calib.core.assessment.moved.possible_shift`.
+    """
+
+    name: str
+    reason: str = ""
+    spread: FloatArray = field(default_factory=_zero_covariance)
+    warnings: tuple[str, ...] = ()
+
+
+def _selected_reference(
+    pose_pairs: PosePairs, method: Method, adaptive: AdaptiveSolution | None
+) -> _Reference:
+    """Return the best reference by the noise model; the arguments are those of _solve_pairs."""
+    from hand_eye_calib.core.assessment.reference_selection import (
+        select_reference,
+    )
+
+    choice = select_reference(
+        pose_pairs, replace(method, backend="fast"), solution=adaptive
+    )
+    model = choice.model
+    if not model.converged or model.unseen.size:
+        return _Reference(choice.reference, choice.reason())
+    spread, warnings = possible_shift(model.part_products, model.misfit)
+    return _Reference(choice.reference, choice.reason(), spread, warnings)
+
+
 def _solve_pairs(
     pose_pairs: PosePairs,
     config: CalibratorConfig,
@@ -498,46 +538,30 @@ def _solve_pairs(
         config.min_inlier_fraction,
         config.backend,
     )
-    reference = config.reference
-    reason = ""
-    spread = _zero_covariance()
-    warnings: tuple[str, ...] = ()
-    best: Stride | None = None
-    if reference == "auto" and method.solve_best_stride:
+    chosen = _Reference(config.reference)
+    if config.reference == "auto" and method.solve_best_stride:
         best = method.solve_best_stride(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c)
-        reference = best.reference
-        reason = f"{reference}: motions over this number of poses have the smallest covariance"
-    elif reference == "auto":
-        from hand_eye_calib.core.assessment.reference_selection import (
-            select_reference,
-        )
-
-        choice = select_reference(
-            pose_pairs, replace(method, backend="fast"), solution=adaptive
-        )
-        reference = choice.reference
-        reason = choice.reason()
-        model = choice.model
-        if model.converged and not model.unseen.size:
-            spread, warnings = possible_shift(model.part_products, model.misfit)
-    if best:
+        reason = f"{best.reference}: motions over this number of poses have the smallest covariance"
+        chosen = _Reference(best.reference, reason)
         pairs = best.pairs
         solution: Solution = best.solution
     else:
-        pairs = _motion_pairs(pose_pairs, reference)
+        if config.reference == "auto":
+            chosen = _selected_reference(pose_pairs, method, adaptive)
+        pairs = _motion_pairs(pose_pairs, chosen.name)
         solution = method.solve(pairs)
     solve_without = partial(method.solve_without, pairs, solution)
     return Solved(
         solution=solution,
         assessment=covariance.assess(pairs, solution, solve_without),
         method=method.name,
-        reference=reference,
+        reference=chosen.name,
         pairs=pairs,
         weights=solution.weights,
         stamps_ns=pose_pairs.stamps_ns,
         config=config,
-        reference_reason=reason,
+        reference_reason=chosen.reason,
         proved_global=method.proved_global(pairs, solution),
-        spread=spread,
-        warnings=warnings,
+        spread=chosen.spread,
+        warnings=chosen.warnings,
     )

@@ -19,6 +19,7 @@ from hand_eye_calib.core.engine.estimation import solve_poses
 from hand_eye_calib.core.engine.kinds import Kind
 from hand_eye_calib.core.engine.snapshot import MOST_MOVED_S, Snapshot
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import AXES
 
@@ -103,13 +104,13 @@ def _limited_by_prior(
     if calibration is None or not priors:
         return covariance
     rotation = se3.rotation_of(calibration.T_parent_child)
-    of_parent = se3.turned(rotation, covariance)
+    of_parent = turned(rotation, covariance)
     factors = np.ones(len(AXES))
     for index, axis in enumerate(AXES):
         if axis in priors:
             sigma = float(np.sqrt(max(of_parent[index, index], 1e-30)))
             factors[index] = min(1.0, priors[axis][1] / sigma)
-    return se3.turned(rotation.T, of_parent * np.outer(factors, factors))
+    return turned(rotation.T, of_parent * np.outer(factors, factors))
 
 
 def _extrinsic_estimate(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hand_eye_calib.core.alignment.similarity import estimate_scale
+from hand_eye_calib.core.alignment.scale import estimate_scale
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.option import Options, options_in_words
 from hand_eye_calib.core.checks.check import CheckResult

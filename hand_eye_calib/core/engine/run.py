@@ -1,8 +1,7 @@
 """From streams to a result: solve, check, repair, and solve at most twice more.
 
 1. Solve the streams with the options of the user. If the angular rates clearly prove that the
-clocks
-   differ, try an estimated time offset first.
+   clocks differ, try an estimated time offset first.
 2. Check the streams with the result.
 3. Choose between two readings of both streams (as poses, or as inverse poses) if both fit equally
    well.
@@ -14,47 +13,41 @@ command line, Python, the node, batches and rigs call :func:`run`, or :func:`rev
 result already.
 """
 
-import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from hand_eye_calib.core.alignment.time_offset import (
-    TimeOffset,
-    refine_time_offset,
-)
-from hand_eye_calib.core.base.config import METHODS, defaults_of
-from hand_eye_calib.core.base.errors import (
-    HandEyeCalibError,
-    NotEnoughDataError,
-)
+from hand_eye_calib.core.base.config import defaults_of
+from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
 from hand_eye_calib.core.checks.findings import (
-    LIMITS,
     Finding,
     Severity,
     gravest_first,
     repair_message,
 )
 from hand_eye_calib.core.checks.findings import finding as new_finding
-from hand_eye_calib.core.checks.hypothesis import HOLDS
 from hand_eye_calib.core.engine import readings as choosing
 from hand_eye_calib.core.engine.attempts import (
     STREAM_REPAIRS,
     Attempt,
     OptionMessage,
+    check,
+    checked,
+    solved_with,
     with_options,
+)
+from hand_eye_calib.core.engine.clock_choice import (
+    ESTIMATED_CLOCK,
+    clock_is_off,
+    on_another_clock,
 )
 from hand_eye_calib.core.engine.kinds import kind_of
 from hand_eye_calib.core.engine.poses import INVERSIONS
-from hand_eye_calib.core.engine.snapshot import (
-    MOST_MOVED_S,
-    UNASKED_S,
-    Snapshot,
-)
+from hand_eye_calib.core.engine.snapshot import UNASKED_S, Snapshot
 from hand_eye_calib.core.engine.solved_values import (
     note_on_unit,
     with_solved_offset,
@@ -70,8 +63,6 @@ Progress: TypeAlias = Callable[[float, str], None]
 # Share of the work that is finished when the checks begin: an estimate for the display of progress.
 _CHECKS_BEGIN = 0.8
 
-_ESTIMATED_CLOCK: Options = {"time_offset": "estimate"}
-
 # Reasons to estimate an option, without the estimate.
 _REASONS_TO_ESTIMATE = {
     "time_offset": "the clocks may differ",
@@ -84,14 +75,6 @@ _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 # Codes of findings whose option is estimated in the second solve, so that the result contains the
 # uncertainty of its value.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
-
-# The time offset of the check, with its clock rate, is used if its spread (see TimeOffset) is below
-# this share of the largest offset in the recording.
-_CLEAR_SPREAD = 0.5
-
-
-# Growth of a sigma by open faults above which a result is examined again.
-_MUCH_WIDER = 1.05
 
 
 @dataclass(frozen=True)
@@ -169,16 +152,16 @@ def review(
     settled : collection of str
         Options that an earlier check has set. Like options of the user, they are not changed.
     """
-    return _best(_checked(calibration, snapshot), settled, None)
+    return _best(checked(calibration, snapshot), settled, None)
 
 
 def _solved_and_checked(
     snapshot: Snapshot, checks: bool | None, report: Progress
 ) -> Attempt:
     """Return the best attempt at a snapshot; ``checks`` is that of :func:`run`."""
-    on_clock = _on_another_clock(snapshot)
+    on_clock = on_another_clock(snapshot)
     if on_clock and on_clock.is_sound and not on_clock.check.readings:
-        return _with_estimate_warnings(on_clock, _ESTIMATED_CLOCK, ())
+        return _with_estimate_warnings(on_clock, ESTIMATED_CLOCK, ())
     try:
         calibration = snapshot.estimate(cross_check=checks)
     except NotEnoughDataError:
@@ -189,7 +172,7 @@ def _solved_and_checked(
             raise
         return repaired
     report(_CHECKS_BEGIN, "checking the streams")
-    return _best(_checked(calibration, snapshot), (), on_clock)
+    return _best(checked(calibration, snapshot), (), on_clock)
 
 
 def _best(
@@ -227,68 +210,6 @@ def _best(
     return best.with_doubts(reading.doubts)
 
 
-# ------------------------------------------------------------------ the clock
-
-
-def _on_another_clock(snapshot: Snapshot) -> Attempt | None:
-    """Return the attempt with an estimated time offset if the clocks clearly differ, else None.
-
-    If this attempt is good, the solve without time offset is saved. It is not made if the options
-    or the kind of data exclude a time offset, or if other mistakes must be repaired first.
-    """
-    config = snapshot.config
-    is_free = (
-        config.method in ("auto", "adaptive") and config.reference == "auto"
-    )
-    is_settled = "time_offset" in config.given or len(snapshot.kept) > 0
-    if is_settled or not is_free or not kind_of(config).has_conventions:
-        return None
-    if not snapshot.correlation.is_clear:
-        return None
-    coarse = TimeOffset(
-        snapshot.correlation.offset_s, correlation=snapshot.correlation
-    )
-    # This precision suffices to decide whether the clocks differ.
-    preliminary = refine_time_offset(
-        *snapshot.streams, coarse, snapshot.max_gap_s, UNASKED_S
-    )
-    fit = preliminary.fit
-    smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
-    if fit is None or smallest_s < MOST_MOVED_S:
-        return None
-    # If conventions or units are wrong, the streams are first solved without a repair: the message
-    # of the repair contains the verdict of this solve.
-    # A smaller difference of lengths is no wrong unit: the noise model estimates it as a scale.
-    scale_error = abs(math.log(fit.scale))
-    is_other_unit = fit.has_own_unit and scale_error >= LIMITS["scale"].error
-    if is_other_unit or fit.unexplained > HOLDS:
-        return None
-    offset = refine_time_offset(
-        *snapshot.streams, preliminary, snapshot.max_gap_s
-    )
-    other = replace(
-        snapshot, config=replace(config, **_ESTIMATED_CLOCK), time_offset=offset
-    )
-    return _solved_with(other, {})
-
-
-def _clock_is_off(first: Attempt) -> bool:
-    """Return whether the time offset has changed so much that poses must be paired anew."""
-    snapshot = first.snapshot
-    calibration = first.calibration
-    moved_s = abs(
-        calibration.time_offset_s - float(snapshot.resolved.config.time_offset)
-    )
-    clock = first.check.offset
-    is_free = not METHODS[snapshot.config.method].uses_reference
-    if clock and is_free and snapshot.config.reference == "auto":
-        # Only the check estimates a clock rate; for DNLO, only the check estimates the offset.
-        largest_s = clock.largest_s(snapshot.unpaired[1].duration_s)
-        if clock.spread_s < _CLEAR_SPREAD * largest_s:
-            moved_s = max(moved_s, largest_s - _CLEAR_SPREAD * clock.spread_s)
-    return moved_s >= kind_of(snapshot.config).least_clock_change_s
-
-
 # ------------------------------------------------------------------ two readings
 
 
@@ -314,7 +235,7 @@ def _reading_of(
         return with_options(snapshot, {**options, **clock}).pose_pairs
 
     def answer_with(options: Options) -> Calibration | None:
-        attempt = _solved_with(snapshot, {**options, **clock})
+        attempt = solved_with(snapshot, {**options, **clock})
         return attempt.calibration if attempt else None
 
     choice = choosing.choose(result, pairs_of, answer_with)
@@ -377,15 +298,7 @@ def _repaired(
     verdict_as_given : str
         Verdict of the streams without the repair, for the message.
     """
-    options = {
-        name: value
-        for name, value in certain_options.items()
-        if value != "estimate"
-    }
-    second = _solved_with(snapshot, options) if options else None
-    if not second and "time_offset" in certain_options:
-        options["time_offset"] = "estimate"
-        second = _solved_with(snapshot, options)
+    second, options = _solved_as_repaired(snapshot, certain_options)
     if not second:
         return None
     settled = {*settled, *options}
@@ -419,6 +332,25 @@ def _repaired(
         {**options, **second.options}, (message, *second.messages)
     )
     return _with_offset_doubt(second, _doubts_beside_a_repair(findings))
+
+
+def _solved_as_repaired(
+    snapshot: Snapshot, certain_options: Options
+) -> tuple[Attempt | None, dict[str, float | str]]:
+    """Return the attempt with certain options, and the options that it needs.
+
+    The time offset is estimated only if otherwise the solve fails.
+    """
+    options = {
+        name: value
+        for name, value in certain_options.items()
+        if value != "estimate"
+    }
+    second = solved_with(snapshot, options) if options else None
+    if not second and "time_offset" in certain_options:
+        options["time_offset"] = "estimate"
+        second = solved_with(snapshot, options)
+    return second, options
 
 
 def _doubts_beside_a_repair(findings: Iterable[Finding]) -> list[Finding]:
@@ -458,12 +390,12 @@ def _estimated(
     """
     fixed = first.snapshot.config.given.union(settled)
     options = dict(certain_options)
-    if "time_offset" not in fixed and _clock_is_off(first):
-        options = {**_ESTIMATED_CLOCK, **options}
+    if "time_offset" not in fixed and clock_is_off(first):
+        options = {**ESTIMATED_CLOCK, **options}
     if not options:
         return first
-    second = on_clock if options == _ESTIMATED_CLOCK else None
-    second = second or _solved_with(first.snapshot, options)
+    second = on_clock if options == ESTIMATED_CLOCK else None
+    second = second or solved_with(first.snapshot, options)
     if not second:
         return first
     if INVERSIONS & fixed:
@@ -551,14 +483,7 @@ def _with_offset_doubt(
     return attempt.with_doubts(doubts)
 
 
-# ------------------------------------------------------------------ one solve
-
-
-def check(
-    snapshot: Snapshot, calibration: Calibration | None = None
-) -> CheckResult:
-    """Check the streams of a snapshot, with their result if there is one."""
-    return kind_of(snapshot.config).check(snapshot, calibration)
+# ------------------------------------------------------------------ options from findings
 
 
 def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
@@ -598,38 +523,6 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
             for issue in findings
         )
     return findings
-
-
-def with_open_errors(
-    calibration: Calibration,
-    result: CheckResult,
-    snapshot: Snapshot | None = None,
-) -> Calibration:
-    """Return the calibration whose allowance contains the faults that a check leaves open.
-
-    If sigmas grow much, the calibration is examined again with its snapshot.
-    """
-    allowance = calibration.covariance_allowance + result.open_covariance
-    wider = replace(calibration, covariance_allowance=allowance)
-    if snapshot and (wider.sigmas > _MUCH_WIDER * calibration.sigmas).any():
-        return snapshot.examined(wider)
-    return wider
-
-
-def _checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
-    """Check the streams of a result, and return the attempt."""
-    result = check(snapshot, calibration)
-    checked = with_open_errors(calibration, result, snapshot)
-    return Attempt(replace(checked, findings=result.findings), snapshot, result)
-
-
-def _solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
-    """Solve and check with some options changed; return None if the solve fails."""
-    try:
-        other = with_options(snapshot, options)
-        return _checked(other.estimate(), other)
-    except HandEyeCalibError:
-        return None
 
 
 def _certain(

@@ -162,36 +162,51 @@ class NoiseModel:
         if self.centre != "sensors":
             white_rotations = self._rotations_about_origin(streams, to_child)
         jitter = twists[:, :, None] * twists[:, None]
-        h1_processes = [np.zeros((len(intervals_s), 6, 0))]
-        h0 = [linearisation.adjoints]
-        for kind, part in self.processes:
-            if kind == "path":
-                by_path = linearisation.by_path[part]
-                h1_processes.append(np.zeros_like(by_path))
-                h0.append(-by_path)
-            else:
-                M = _directions(kind, part, streams, to_child)
-                h1_processes.append(M[1:])
-                h0.append(linearisation.adjoints @ M[:-1])
+        h1_processes, h0_processes = self._process_matrices(
+            streams, linearisation, to_child
+        )
+        h0 = linearisation.adjoints
+        if self.processes:
+            h0 = np.concatenate([h0, *h0_processes], axis=2)
+        no_process = np.zeros((len(intervals_s), 6, 0))
         return StateSpace(
             intervals_s=intervals_s,
             walk_factors=np.clip(
                 intervals_s / self.interval_s, *_WALK_FACTOR_LIMITS
             ),
             columns=linearisation.columns,
-            h1_processes=np.concatenate(h1_processes, axis=2),
-            h0=np.concatenate(h0, axis=2)
-            if self.processes
-            else linearisation.adjoints,
+            h1_processes=np.concatenate([no_process, *h1_processes], axis=2),
+            h0=h0,
             white_bases=(TRANSLATIONS[None], white_rotations, jitter),
             walk_bases=(TRANSLATIONS, rotations),
-            group_sizes=tuple(
-                matrices.shape[2] for matrices in h1_processes[1:]
-            ),
+            group_sizes=tuple(matrices.shape[2] for matrices in h1_processes),
             weights=weights,
             cut=cut,
             prior=prior,
         )
+
+    def _process_matrices(
+        self,
+        streams: Streams,
+        linearisation: Linearisation,
+        to_child: FloatArray,
+    ) -> tuple[list[FloatArray], list[FloatArray]]:
+        """Return the matrices (N - 1, 6, .) of each process at the end and at the start of steps.
+
+        ``to_child`` (6, 6) is the adjoint of the inverse of X.
+        """
+        at_end = []
+        at_start = []
+        for kind, part in self.processes:
+            if kind == "path":
+                by_path = linearisation.by_path[part]
+                at_end.append(np.zeros_like(by_path))
+                at_start.append(-by_path)
+            else:
+                M = _directions(kind, part, streams, to_child)
+                at_end.append(M[1:])
+                at_start.append(linearisation.adjoints @ M[:-1])
+        return at_end, at_start
 
     def _rotations_about_origin(
         self, streams: Streams, to_child: FloatArray

@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import parse_reference
 from hand_eye_calib.core.geometry import se3
@@ -132,6 +132,25 @@ def synchronise(
     return PosePairs(stamps_ns, fast_poses, slow_poses)
 
 
+def _has_moved(
+    T_last: FloatArray,
+    poses: FloatArray,
+    min_translation: float,
+    min_rotation: float,
+) -> BoolArray:
+    """Whether poses (N, 4, 4) are far from the last keyframe, by a threshold that is not zero."""
+    if max(min_translation, min_rotation) == 0.0:
+        return np.ones(len(poses), dtype=bool)
+    has_moved = np.zeros(len(poses), dtype=bool)
+    if min_translation > 0.0:
+        steps = se3.translation_of(poses) - se3.translation_of(T_last)
+        has_moved |= np.linalg.norm(steps, axis=1) >= min_translation
+    if min_rotation > 0.0:
+        rotations = se3.rotation_of(T_last).T @ se3.rotation_of(poses)
+        has_moved |= se3.rotation_angle(rotations) >= min_rotation
+    return has_moved
+
+
 def select_keyframes(
     pose_pairs: PosePairs,
     min_translation: float,
@@ -174,19 +193,9 @@ def select_keyframes(
     while index < n_poses:
         window = slice(index, index + _WINDOW)
         has_passed = stamps_ns[window] - last_ns >= min_interval_s * 1e9
-        has_moved = np.full(
-            len(has_passed), max(min_translation, min_rotation) == 0.0
+        has_moved = _has_moved(
+            T_last, poses[window], min_translation, min_rotation
         )
-        if min_translation > 0.0:
-            distances_m = np.linalg.norm(
-                poses[window, :3, 3] - se3.translation_of(T_last), axis=1
-            )
-            has_moved |= distances_m >= min_translation
-        if min_rotation > 0.0:
-            angles = se3.rotation_angle(
-                se3.rotation_of(T_last).T @ poses[window, :3, :3]
-            )
-            has_moved |= angles >= min_rotation
         candidates = np.flatnonzero(has_passed & has_moved)
         if not candidates.size:
             index += _WINDOW

@@ -15,7 +15,7 @@ from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import RESULT_METHODS
 from hand_eye_calib.core.base.text import AXIS_UNITS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import (
+from hand_eye_calib.core.geometry.covariances import (
     inverse_covariance,
     sigmas_in_parent,
 )

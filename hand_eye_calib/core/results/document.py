@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.text import (
     with_sigma,
 )
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import (
+from hand_eye_calib.core.geometry.covariances import (
     inverse_covariance,
     sigmas_in_parent,
     sigmas_rpy,

@@ -12,7 +12,10 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import sigmas_in_parent, sigmas_rpy
+from hand_eye_calib.core.geometry.covariances import (
+    sigmas_in_parent,
+    sigmas_rpy,
+)
 from hand_eye_calib.core.results import records
 from hand_eye_calib.core.results.parts import all_parts
 

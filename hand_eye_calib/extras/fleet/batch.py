@@ -31,10 +31,10 @@ from hand_eye_calib.extras.fleet.work import (
 from hand_eye_calib.formats.bags.patterns import is_other_file, matching
 from hand_eye_calib.formats.results import save_result, save_text
 from hand_eye_calib.offline.beside_motion import switched_off
+from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import (
     Exit,
     note,
-    options_from,
     sources_from,
     waiting_for,
     with_progress,

@@ -28,7 +28,7 @@ from hand_eye_calib.core.base.errors import (
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.text import listing
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.geometry.trajectory import TrajectoryLike
 from hand_eye_calib.core.results.calibration import (
     Calibration,
@@ -234,12 +234,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
         name: result for name, result in results.items() if name not in left_out
     }
     if not usable:
-        reasons = "; ".join(
-            f"{name}: {reason}" for name, reason in left_out.items()
-        )
-        raise InputError(
-            f"no recording can be used: {reasons or 'there is none'}"
-        )
+        raise _nothing_usable(left_out)
     agreement = agreement_of_results([*usable.values()])
     names = [*usable]
     for index in agreement.apart:
@@ -247,12 +242,45 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     used = {
         name: result for name, result in usable.items() if name not in left_out
     }
-    # Unusable recordings are not compared.
+    record = Together(
+        kind=agreement.kind,
+        sentence=agreement.sentence(names),
+        scatter=by_axis(agreement.scatter),
+        recordings=_records_of(results, left_out, names, agreement),
+    )
+    return _joint(used, agreement, record)
+
+
+def _nothing_usable(left_out: Mapping[str, str]) -> InputError:
+    """Return the error that every recording was left out, with the reason of each recording."""
+    reasons = "; ".join(
+        f"{name}: {reason}" for name, reason in left_out.items()
+    )
+    return InputError(f"no recording can be used: {reasons or 'there is none'}")
+
+
+def _records_of(
+    results: Mapping[str, Calibration],
+    left_out: Mapping[str, str],
+    compared: Sequence[str],
+    agreement: Agreement,
+) -> tuple[Recorded, ...]:
+    """Return a record of each recording.
+
+    Parameters
+    ----------
+    results : mapping of str to Calibration
+    left_out : mapping of str to str
+        Reasons why recordings are left out.
+    compared : sequence of str
+        Names of the recordings in ``agreement``. Unusable recordings are not compared.
+    agreement : Agreement
+    """
     unknown = np.full(6, np.nan)
     deviations = dict.fromkeys(results, unknown)
-    deviations |= dict(zip(names, agreement.deviations, strict=True))
+    deviations |= dict(zip(compared, agreement.deviations, strict=True))
     sigmas = dict.fromkeys(results, unknown)
-    sigmas |= dict(zip(names, agreement.sigmas, strict=True))
+    sigmas |= dict(zip(compared, agreement.sigmas, strict=True))
     records = []
     for name, result in results.items():
         recorded = Recorded(
@@ -266,13 +294,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
             stamp_ns=result.stamp_ns,
         )
         records.append(recorded)
-    record = Together(
-        kind=agreement.kind,
-        sentence=agreement.sentence(names),
-        scatter=by_axis(agreement.scatter),
-        recordings=tuple(records),
-    )
-    return _joint(used, agreement, record)
+    return tuple(records)
 
 
 def _is_unusable(result: Calibration) -> bool:

@@ -23,7 +23,7 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks
 from hand_eye_calib.core.base.stats import CHI2, MEDIAN_NORMAL, median, medians
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
+from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import (
     Calibration,

@@ -35,7 +35,7 @@ from hand_eye_calib.core.base.blocks import (
 )
 from hand_eye_calib.core.base.stats import NINE_TIMES_OUT_OF_TEN, robust_weights
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import sigmas_in_parent
+from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
 from hand_eye_calib.core.pairing.motion_pairs import (
     MotionPairs,
     PosePairs,

@@ -12,7 +12,7 @@ with noise has an instrument, the same column computed from the other stream (W.
 of windows estimates the covariance.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -237,6 +237,19 @@ class Fit:
         return np.outer(shift, shift) + growth
 
 
+def _places_of(
+    columns: Mapping[str, Column], tables: Sequence[FloatArray]
+) -> tuple[dict[str, list[int]], list[float]]:
+    """Return the indices of the values of each fault, and the prior information on all values."""
+    places: dict[str, list[int]] = {}
+    information: list[float] = []
+    for (name, column), table in zip(columns.items(), tables, strict=True):
+        start = len(information)
+        information += [column.sigma**-2] * table.shape[3]
+        places[name] = list(range(start, len(information)))
+    return places, information
+
+
 def fit_columns(
     columns: Mapping[str, Column],
     windows: Any,
@@ -258,19 +271,12 @@ def fit_columns(
     nuisances : (W, K, 3, n) array
         Columns of the unknowns that each window has on its own.
     """
-    tables = []
+    tables = [column.rows(windows) for column in columns.values()]
     instruments = []
-    places: dict[str, list[int]] = {}
-    information: list[float] = []
-    for name, column in columns.items():
-        table = column.rows(windows)
-        tables.append(table)
-        instruments.append(
-            column.instrument(windows) if column.instrument else table
-        )
-        start = len(information)
-        information += [column.sigma**-2] * table.shape[3]
-        places[name] = list(range(start, len(information)))
+    for column, table in zip(columns.values(), tables, strict=True):
+        instrument = column.instrument
+        instruments.append(instrument(windows) if instrument else table)
+    places, information = _places_of(columns, tables)
     prior = np.diag([*information, 0.0])
     # Project the nuisances out, with an orthonormal basis (W, 3 K, n).
     basis, triangle = np.linalg.qr(_flat([nuisances], is_used))

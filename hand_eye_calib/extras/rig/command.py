@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.results.document import summary, transforms_of
 from hand_eye_calib.offline.beside_motion import switched_off, with_measurements
+from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import (
     note,
-    options_from,
     print_result,
     refuse_options_of_bags,
     waiting_for,

@@ -17,16 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.errors import (
-    InputError,
-    MissingDependencyError,
-    required,
-)
+from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.errors import InputError, MissingDependencyError
 from hand_eye_calib.core.base.text import shortened
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.sensors.nmea import places_of
+from hand_eye_calib.extras.sensors.ulog import logged_poses
 from hand_eye_calib.formats.files import LONGEST_LINE, LONGEST_NAME
 from hand_eye_calib.formats.trajectory_files.columns import (
     MATRIX,
@@ -40,10 +36,8 @@ from hand_eye_calib.formats.trajectory_files.dates import (
     WEEK_S,
 )
 from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
-from hand_eye_calib.formats.trajectory_files.table import (
-    Table,
-    columns_of_array,
-)
+from hand_eye_calib.formats.trajectory_files.objects import columns_of_array
+from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Names of the columns of a pose.
 _POSE = (*POSITION, *QUATERNION)
@@ -455,26 +449,7 @@ def _of_pcd(data: bytes, _: str | None) -> _Rows:
 
 def _of_ulog(data: bytes, _: str | None) -> _Rows:
     """Read a log of PX4: the odometry of its estimator, or local positions with attitudes."""
-    pyulog = required("pyulog", "a log of PX4", "px4")
-    topics = ["vehicle_odometry", "vehicle_local_position", "vehicle_attitude"]
-    try:
-        log = pyulog.ULog(io.BytesIO(data), topics)
-        first_instances = [
-            logged for logged in log.data_list if logged.multi_id == 0
-        ]
-        stamps_us, Ts = _logged_poses(
-            {logged.name: logged.data for logged in first_instances}
-        )
-    # Damaged logs raise errors of many kinds.
-    except Exception as error:
-        reason = (
-            ""
-            if isinstance(error, KeyError)
-            else f", {type(error).__name__}: {error}"
-        )
-        raise ValueError(
-            f"the log of PX4 does not contain {' or '.join(topics[:2])}{reason}"
-        ) from None
+    stamps_us, Ts = logged_poses(data)
     flip = np.diag([*np.diag(_FLIP), 1.0])
     poses = _as_rows(flip @ Ts @ flip).tolist()
     rows = [
@@ -483,49 +458,6 @@ def _of_ulog(data: bytes, _: str | None) -> _Rows:
     ]
     note = "axes: x forward, y left, z up, in north, west, up; PX4 has forward, right, down"
     return _Rows(("t [us]", *MATRIX), rows, [note])
-
-
-def _logged_poses(data: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
-    """Return stamps (N,), us, and poses (N, 4, 4) from the topics of a log of PX4."""
-    quaternion = ["q[1]", "q[2]", "q[3]", "q[0]"]
-    if "vehicle_odometry" in data:
-        odometry = data["vehicle_odometry"]
-        place = (
-            [*POSITION]
-            if "x" in odometry
-            else ["position[0]", "position[1]", "position[2]"]
-        )
-        stamps_us, values = _logged(odometry, *place, *quaternion)
-        return stamps_us, se3.from_quat_xyzw(values[:, :3], values[:, 3:])
-    stamps_us, positions = _logged(data["vehicle_local_position"], *POSITION)
-    times_us, quats_xyzw = _logged(data["vehicle_attitude"], *quaternion)
-    no_positions = np.zeros((len(times_us), 3))
-    attitudes = Trajectory.from_quat_xyzw(
-        1000 * times_us, no_positions, quats_xyzw
-    )
-    is_inside = (stamps_us >= times_us[0]) & (stamps_us <= times_us[-1])
-    stamps_us = stamps_us[is_inside]
-    Ts = attitudes.at(1000 * stamps_us)
-    Ts[:, :3, 3] = positions[is_inside]
-    return stamps_us, Ts
-
-
-def _logged(
-    data: Mapping[str, Any], *names: str
-) -> tuple[IntArray, FloatArray]:
-    """Return the valid values of a topic in a log of PX4, and their increasing stamps (us)."""
-    values = np.stack([data[name] for name in names], axis=1).astype(float)
-    is_valid = np.isfinite(values).all(axis=1)
-    # Local positions have these flags.
-    for flag in {"xy_valid", "z_valid"} & data.keys():
-        is_valid &= data[flag] > 0
-    if not is_valid.any():
-        raise ValueError(f"none of {', '.join(names)} is valid")
-    stamps_us = data.get("timestamp_sample", data["timestamp"])[
-        is_valid
-    ].astype(np.int64)
-    stamps_us, first = np.unique(stamps_us, return_index=True)
-    return stamps_us, values[is_valid][first]
 
 
 def _as_rows(poses: FloatArray) -> FloatArray:

@@ -105,6 +105,26 @@ def simulate(
     return simulate_drive(seed, config, noise)
 
 
+def _drawn_extrinsic(rng: np.random.Generator) -> FloatArray:
+    """Return a random extrinsic (4, 4): any rotation, and a translation within some metres."""
+    rotation = se3.rotation_of(
+        se3.from_quat_xyzw(np.zeros(3), rng.standard_normal(4))
+    )
+    translation = rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
+    return se3.from_rotation_translation(rotation, translation)
+
+
+def _drawn_worlds(rng: np.random.Generator) -> FloatArray:
+    """Return a random pose (4, 4) of the child's world in the parent's world.
+
+    Yaw, pitch, roll (rad) and translation (m) are differences of two uniform random numbers each.
+    """
+    first = rng.uniform(size=(2, 3))
+    angles, translation = first - rng.uniform(size=(2, 3))
+    rotation = se3.rotation_from_rpy(angles[::-1])
+    return se3.from_rotation_translation(rotation, translation)
+
+
 def simulate_drive(
     seed: int | Sequence[int],
     config: options.DriveConfig = options.PUBLISHED_DRIVE,
@@ -138,20 +158,11 @@ def simulate_drive(
     Ts_pw_p = _poses_on_terrain(config, positions, headings)
     Ts_pw_p_at_child = Ts_pw_p[config.poses :]
     Ts_pw_p = Ts_pw_p[: config.poses]
-    rotation = se3.rotation_of(
-        se3.from_quat_xyzw(np.zeros(3), extrinsic_rng.standard_normal(4))
-    )
-    offset = extrinsic_rng.uniform(-_LARGEST_OFFSET_M, _LARGEST_OFFSET_M, 3)
+    # The random numbers are drawn even if they are not needed, so that those of the worlds stay.
+    T_drawn = _drawn_extrinsic(extrinsic_rng)
     if T_parent_child is None:
-        T_parent_child = se3.from_rotation_translation(rotation, offset)
-    # Pose of the child's world: yaw, pitch, roll (rad) and translation (m) are differences of two
-    # uniform random numbers each.
-    angles, translation = extrinsic_rng.uniform(
-        size=(2, 3)
-    ) - extrinsic_rng.uniform(size=(2, 3))
-    T_pw_cw = se3.from_rotation_translation(
-        se3.rotation_from_rpy(angles[::-1]), translation
-    )
+        T_parent_child = T_drawn
+    T_pw_cw = _drawn_worlds(extrinsic_rng)
     Ts_cw_c = se3.inverse(T_pw_cw) @ Ts_pw_p_at_child @ T_parent_child
     Ts_pw_p, Ts_cw_c = add_noise(Ts_pw_p, Ts_cw_c, noise, noise_rng)
 
@@ -159,9 +170,8 @@ def simulate_drive(
         times_s: FloatArray, Ts_world_sensor: FloatArray, frame: str
     ) -> Trajectory:
         """Return a trajectory with stamps that begin at the start time of the drive."""
-        stamps_ns = round(config.start_time * 1e9) + np.round(
-            times_s * 1e9
-        ).astype(np.int64)
+        since_start_ns = np.round(times_s * 1e9).astype(np.int64)
+        stamps_ns = round(config.start_time * 1e9) + since_start_ns
         return Trajectory(stamps_ns, Ts_world_sensor, frame, f"{frame}_odom")
 
     return SimulatedDrive(

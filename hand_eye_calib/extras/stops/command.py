@@ -29,12 +29,12 @@ from hand_eye_calib.extras.stops.calibrate import (
 from hand_eye_calib.extras.stops.pose_files import read_robot_folder
 from hand_eye_calib.extras.stops.robot_angles import ROBOTS, read_robot_poses
 from hand_eye_calib.extras.stops.samples import read_arm_samples
+from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import (
     FILE_OPTIONS,
     STREAMS,
     flag,
     note,
-    options_from,
     with_progress,
 )
 from hand_eye_calib.offline.cli.reading import read_files, refuse_repeated_paths

@@ -376,9 +376,8 @@ def _fit(
         distances = squared @ (1.0 / variances)
         weights = rests * student_weights(distances, degrees)
         whitening = np.sqrt(weights[:, None] * np.repeat(1.0 / variances, 3))
-        rows = whitening[..., None] * np.concatenate(
-            [jacobian, errors[..., None]], axis=2
-        )
+        equations = np.concatenate([jacobian, errors[..., None]], axis=2)
+        rows = whitening[..., None] * equations
         products = _products(rows)
         step = _gauss_newton_step(products)
         step_X, step_Z = se3.exp(step.reshape(2, 6))
@@ -388,15 +387,12 @@ def _fit(
         if converged:
             break
     # Expected information of the Student-t likelihood: Lange, Little, Taylor 1989, section 4.
-    rows *= np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)[
-        :, None, None
-    ]
-    fisher = _products(rows)[:-1, :-1]
+    factors = np.sqrt((degrees + 6.0) / (degrees + 8.0) * rests / weights)
+    fisher = _products(rows * factors[:, None, None])[:-1, :-1]
     is_outlier = distances >= _OUTLIER_SQUARED
     log_tails = rests @ np.log1p(distances / degrees)
-    objective = (
-        1.5 * n * np.log(variances).sum() + 0.5 * (degrees + 6.0) * log_tails
-    )
+    log_variances = 1.5 * n * np.log(variances).sum()
+    objective = log_variances + 0.5 * (degrees + 6.0) * log_tails
     fit = RobotWorld(
         T_parent_child=X,
         T_world_world=Z,

@@ -8,7 +8,7 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.plain import Document, from_plain
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import inverse_covariance
+from hand_eye_calib.core.geometry.covariances import inverse_covariance
 from hand_eye_calib.core.results.document import matrix_of
 from hand_eye_calib.core.results.parts import ExtraTransform, Part
 from hand_eye_calib.core.results.stored import covariance_of, transform_of

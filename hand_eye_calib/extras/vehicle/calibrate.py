@@ -10,7 +10,8 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectories
 from hand_eye_calib.offline.calibrate import calibrate
 from hand_eye_calib.offline.cli import reading
-from hand_eye_calib.offline.cli.options import note, options_from
+from hand_eye_calib.offline.cli.config_file import options_from
+from hand_eye_calib.offline.cli.options import note
 from hand_eye_calib.offline.cli.present import deliver
 
 

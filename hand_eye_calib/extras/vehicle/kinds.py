@@ -33,19 +33,15 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import AXES, Residuals
+from hand_eye_calib.extras.vehicle.drive import CLOCK, TILT, YAW, Drive, Y
 from hand_eye_calib.extras.vehicle.parameters import (
     VehicleParameter,
     VehicleParameters,
 )
 from hand_eye_calib.extras.vehicle.solving import (
     BLOCKS,
-    CLOCK,
     N_FIXED,
-    TILT,
-    YAW,
-    Drive,
     Fit,
-    Y,
     fit_drive,
 )
 from hand_eye_calib.extras.vehicle.wheels import MODELS, RIVALS, steps_of

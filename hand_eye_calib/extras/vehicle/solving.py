@@ -34,15 +34,15 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks, inverse, solve
 from hand_eye_calib.core.base.stats import CHI2, STUDENT, share_of_step
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.extras.vehicle.wheels import WheelModel, motions
-
-# Indices of some of the U unknowns. Order of the unknowns: the pose of the sensor (x, y in m;
-# rotations about the axes x, y, z of the axle in rad), the clock offset (s), the slip angle per
-# lateral acceleration (rad s^2/m), and the parameters of the wheels.
-Y = 1
-TILT = (2, 3)
-YAW = 4
-CLOCK = 5
+from hand_eye_calib.extras.vehicle.drive import (
+    CLOCK,
+    STEP,
+    TILT,
+    YAW,
+    Drive,
+    Y,
+    apply_step,
+)
 
 # Prior standard deviations of the unknowns before the parameters of the wheels, in their units.
 # They keep the iteration in bounds. Only the last one, of the slip angle, is real prior knowledge.
@@ -111,104 +111,10 @@ _MAX_ROUNDS = 20
 _NOISE_ROUNDS = 5
 # The iteration ends if the step is below this number of standard deviations.
 _STEP_SIGMAS = 0.01
-# Step of numerical derivatives, in the unit of each unknown.
-_STEP = 1e-6
 # Assumed variance of turns (rad^2), if the poses have neither turns nor tilt to compare.
 _TURN_VARIANCE = 1e-6
 # Smallest variance of a component of the residual (m^2 or rad^2). It is for data without noise.
 _MIN_VARIANCE = 1e-14
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Motions of a sensor in K windows, and the wheel data.
-
-    Attributes
-    ----------
-    xi : (K, 6) array
-        Logarithms (rho, phi) of the motions, in the frame of the sensor.
-    ends_s : (2, K) array
-        Times of the start and the end of each window.
-    stamps_s : (N + 1,) array
-        Times of the wheel data.
-    steps : (3, N) array
-        Steps of the unit vehicle between these times, see :mod:`.wheels`.
-    model : WheelModel or None
-        Model of the wheels; None without wheels.
-    components : sequence of int
-        Indices of the C compared components of e (of six).
-    """
-
-    xi: FloatArray
-    ends_s: FloatArray
-    stamps_s: FloatArray
-    steps: FloatArray
-    model: WheelModel | None
-    components: Sequence[int]
-
-    def motions_of_unit_vehicle(self) -> FloatArray:
-        """Return the sums (3, K) of the steps in each window: forward, left and turn."""
-        totals = np.insert(np.cumsum(self.steps, axis=1), 0, 0.0, axis=1)
-        at_ends = np.array(
-            [np.interp(self.ends_s, self.stamps_s, total) for total in totals]
-        )
-        return at_ends[:, 1] - at_ends[:, 0]
-
-    def measured(self, T: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle according to the sensor, for its pose T (4, 4)."""
-        return self.xi @ se3.adjoint(T).T
-
-    def predicted(self, T: FloatArray, others: FloatArray) -> FloatArray:
-        """Return the motions (K, 6) of the axle according to the wheels.
-
-        Without wheels, only the side slip is predicted, from the motion of the sensor at the pose
-        T. ``others`` are all unknowns except the pose.
-        """
-        clock_s, slip = others[:2]
-        # Over a length l with the speed v and the turn a, the slip angle is slip * v a / t with the
-        # duration t = l / v. So the axle slips to the side by l * slip * v a / t = slip * v^2 a.
-        predicted = np.zeros(self.xi.shape)
-        if self.model is None:
-            axle = self.measured(T)
-            speeds = axle[:, 0] / (self.ends_s[1] - self.ends_s[0])
-            predicted[:, 1] = -slip * speeds**2 * axle[:, 5]
-            return predicted
-        forward, left, turns = self.model.steps_of(others[2:], *self.steps)
-        speeds = forward / np.diff(self.stamps_s)
-        steps = np.stack([forward, left - slip * speeds**2 * turns, turns])
-        predicted[:, [0, 1, 5]] = motions(
-            self.stamps_s, steps, self.ends_s + clock_s
-        ).T
-        return predicted
-
-    def rows(self, T: FloatArray, others: FloatArray) -> FloatArray:
-        """Return the linear equations (K, C, U + 1) of a step of the U unknowns.
-
-        The columns are the derivatives of e with respect to the unknowns, and -e.
-        """
-        predicted = self.predicted(T, others)
-        residuals = predicted - self.measured(T)
-        columns = []
-        for index, step in enumerate(_STEP * np.eye(CLOCK + len(others))):
-            new_T, new_others = apply_step(T, others, step)
-            # The prediction by the wheels does not depend on the pose.
-            if self.model is None or index >= CLOCK:
-                predicted = self.predicted(new_T, new_others)
-            columns.append(
-                (predicted - self.measured(new_T) - residuals) / _STEP
-            )
-        return np.stack([*columns, -residuals], axis=-1)[:, self.components]
-
-
-def apply_step(
-    T: FloatArray, others: FloatArray, step: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the pose and the other unknowns after a step (U,)."""
-    rotation = se3.rotation_exp(step[Y + 1 : CLOCK]) @ se3.rotation_of(T)
-    translation = se3.translation_of(T) + np.append(step[: Y + 1], 0.0)
-    return se3.from_rotation_translation(rotation, translation), others + step[
-        CLOCK:
-    ]
 
 
 @dataclass(frozen=True)
@@ -430,9 +336,7 @@ def _solve(
     sigmas: FloatArray,
     is_weighted: bool = True,
 ) -> Fit:
-    """Minimise the weighted squares of the residuals e and of the prior deviations.
-
-    The method is Gauss-Newton. See the module for e.
+    """Minimise the weighted squares of e and of the prior deviations by Gauss-Newton steps.
 
     Parameters
     ----------
@@ -450,30 +354,23 @@ def _solve(
     everything = range(len(sigmas))
     # Products of the prior equations: the information, and its product with the step to the prior
     # mean.
-    prior = np.zeros((len(sigmas) + 1, len(sigmas) + 1))
-    prior[:-1, :-1] = np.diag(sigmas**-2.0)
+    prior = np.diag(np.append(sigmas**-2.0, 0.0))
     T = start
     first_others = others
     noise = np.zeros((0, 0))
     for _ in range(_MAX_ROUNDS):
         rows = drive.rows(T, others)
         weights, noise = _weights(rows[..., -1], noise, is_weighted)
-        whitening = np.linalg.cholesky(inverse(noise)).T
-        weighted = np.sqrt(weights)[:, None, None] * (whitening @ rows)
+        weighted = _whitened(rows, weights, noise)
         blocks = Blocks.of_rows(weighted, BLOCKS)
-        prior[:-1, -1] = (
-            -_difference(T, others, start, first_others) / sigmas**2
-        )
+        deviation = _difference(T, others, start, first_others)
+        prior[:-1, -1] = -deviation / sigmas**2
         table = blocks.total + prior
         step = solve(table, everything)
         T, others = apply_step(T, others, step)
-        model = inverse(
-            table[:-1, :-1]
-        )  # covariance (U, U) if windows are independent
-        sigmas_of_step = np.sqrt(np.diag(model))
-        converged = bool(
-            (np.abs(step) < _STEP_SIGMAS * sigmas_of_step + _STEP).all()
-        )
+        # Covariance (U, U) if windows are independent.
+        model = inverse(table[:-1, :-1])
+        converged = _is_small(step, np.sqrt(np.diag(model)))
         if converged:
             break
     spread = _tapered_jackknife(Blocks.of_rows(weighted, len(weighted)), prior)
@@ -492,6 +389,19 @@ def _solve(
         objective=float(blocks.total[-1, -1]),
         converged=converged,
     )
+
+
+def _whitened(
+    rows: FloatArray, weights: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """Return equations (K, C, U + 1), multiplied by roots of their weights and of 1 / noise."""
+    whitening = np.linalg.cholesky(inverse(noise)).T
+    return np.sqrt(weights)[:, None, None] * (whitening @ rows)
+
+
+def _is_small(step: FloatArray, sigmas: FloatArray) -> bool:
+    """Whether a step (U,) is far below the standard deviations of the unknowns."""
+    return bool((np.abs(step) < _STEP_SIGMAS * sigmas + STEP).all())
 
 
 def _tapered_jackknife(windows: Blocks, prior: FloatArray) -> FloatArray:

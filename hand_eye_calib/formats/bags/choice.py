@@ -145,20 +145,27 @@ def choose(
     of_known_kinds = [
         sensor for sensor in sensors if sensor.rank < len(_SENSORS)
     ]
-    groups: list[Sequence[TopicInfo | _Candidate]] = [
-        poses,
-        moving,
-        moving + paths,
-        moving + others,
-        sensors,
-        of_known_kinds,
-    ]
+    groups: list[Sequence[TopicInfo | _Candidate]] = [poses, moving]
+    groups += [moving + paths, moving + others, sensors, of_known_kinds]
     # The choice is obvious if the number of topics in a group fits, or the number of sensors.
     for group in groups:
         if len(group) == n_missing:
             return [item.name for item in group]
     if len(sensors) < n_missing <= len(candidates):
         sensors = candidates
+    partners = _partners(topics, n_missing, sensors, frame_of)
+    raise _unclear(
+        topics, [sensor.topic for sensor in sensors], missing, edges, partners
+    )
+
+
+def _partners(
+    topics: Sequence[TopicInfo],
+    n_missing: int,
+    sensors: Sequence[_Candidate],
+    frame_of: Callable[[str], str],
+) -> Sequence[TopicInfo]:
+    """Return the topics that may be the other stream of the sensors."""
     partners = topics
     if len(sensors) == 1 and sensors[0].frame:
         # A topic of the same sensor cannot be the other stream.
@@ -169,9 +176,7 @@ def choose(
         partners = [
             topic for topic in partners if topic.type != messages.JOINTS_TYPE
         ]
-    raise _unclear(
-        topics, [sensor.topic for sensor in sensors], missing, edges, partners
-    )
+    return partners
 
 
 def _topic_of_each_sensor(candidates: Sequence[_Candidate]) -> list[_Candidate]:

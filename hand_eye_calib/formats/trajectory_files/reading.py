@@ -31,13 +31,14 @@ from hand_eye_calib.formats.trajectory_files.file_options import (
     AUTO,
     FileOptions,
 )
+from hand_eye_calib.formats.trajectory_files.objects import table_of_object
 from hand_eye_calib.formats.trajectory_files.poses import poses_of
 from hand_eye_calib.formats.trajectory_files.stamps import (
     in_order,
     refuse_coarse,
     stamps_in_ns,
 )
-from hand_eye_calib.formats.trajectory_files.table import Table, table_of_object
+from hand_eye_calib.formats.trajectory_files.table import Table
 from hand_eye_calib.formats.trajectory_files.text_files import read_table
 
 # Interval (ns) of the regular stamps that poses get if they are paired without stamps.

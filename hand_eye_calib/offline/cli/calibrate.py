@@ -19,6 +19,7 @@ from hand_eye_calib.core.base.registry import (
 )
 from hand_eye_calib.offline.beside_motion import switched_off
 from hand_eye_calib.offline.cli import options
+from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import note, print_result, waiting_for
 from hand_eye_calib.offline.cli.paths import directory, refuse_wrong_paths
 
@@ -187,7 +188,7 @@ def _run_locally(
 
     paths = arguments.paths
     are_bags = arguments.command == "replay" or reading.are_bags(paths)
-    settings = options.options_from(arguments)
+    settings = options_from(arguments)
     if not are_bags:
         if len(paths) != len(options.STREAMS):
             raise ConfigError(

@@ -9,6 +9,7 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.spelling import Interface
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.offline.cli import options
+from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import (
     STREAMS,
     fail,
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     from hand_eye_calib.core.engine.snapshot import whole_snapshot
     from hand_eye_calib.offline.report.evidence import summarise
 
-    settings = options.options_from(arguments)
+    settings = options_from(arguments)
     recording = _read_streams(arguments, settings)
     sources = recording.sources
     parent, child = recording.trajectories

@@ -64,7 +64,7 @@ def write_session_report(directory: Path, session: SessionResult) -> None:
     """
     if not session.with_report:
         return
-    from hand_eye_calib.core.engine.run import check
+    from hand_eye_calib.core.engine.attempts import check
     from hand_eye_calib.formats.results import save_result
 
     checked = check(session.snapshot, session.calibration)

@@ -49,6 +49,8 @@ UNITS = {
 # The same for the stops of an arm, whose table has millimetres, too.
 _UNITS_OF_STOPS = {**UNITS, "x": (1000.0, "translation (mm)")}
 
+_AXIS_LABELS = ("x (m)", "y (m)", "z (m)")
+
 # Why the rates of both streams must coincide, by the quantity that is drawn.
 _WHY_EQUAL = {
     "angular rate": "Two sensors on one rigid body have the same angular rate at every moment, "
@@ -214,13 +216,29 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
 
 
 @page_style()
+def _axes_of_motion(positions: FloatArray) -> tuple[int, int, int]:
+    """Return both axes of the plane of motion of positions (N, 3), and the axis across this plane.
+
+    The axis with the least motion is across the plane: z on a vehicle, y for a camera.
+    """
+    across = int(np.argmin(np.ptp(positions, axis=0)))
+    first, second = (axis for axis in range(3) if axis != across)
+    return first, second, across
+
+
+def _name_plane(plane: Axes, first: int, second: int) -> None:
+    """Set the title of the panel of two axes, and name these axes."""
+    is_level = (first, second) == (0, 1)
+    plane.set(title="From above" if is_level else "In the plane of motion")
+    plane.set(xlabel=_AXIS_LABELS[first], ylabel=_AXIS_LABELS[second])
+    plane.set_aspect("equal", adjustable="datalim")
+
+
 def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     """Draw both paths of one sensor in the plane of motion, and across this plane over time."""
     rows = _downsample(len(evidence.times_s))
     factor, unit = _time_axis(evidence.times_s[-1])
-    # The axis with the least motion is across the plane of motion: z on a vehicle, y for a camera.
-    across = int(np.argmin(np.ptp(evidence.parent, axis=0)))
-    first, second = (axis for axis in range(3) if axis != across)
+    first, second, across = _axes_of_motion(evidence.parent)
     figure, (plane, side) = make_panels(3.75, 1, 2)
     parent = calibration.parent_frame
     child = calibration.child_frame
@@ -247,17 +265,9 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
         )
         side.plot(evidence.times_s[rows] * factor, points[:, across], **look)
     plane.plot(*evidence.parent[0, [first, second]], "o", color=INK, ms=6)
-    axes = ("x (m)", "y (m)", "z (m)")
-    is_level = across == 2
-    plane.set(title="From above" if is_level else "In the plane of motion")
-    plane.set(
-        xlabel=axes[first],
-        ylabel=axes[second],
-        aspect="equal",
-        adjustable="datalim",
-    )
-    side.set(title="Height" if is_level else "Across the plane of motion")
-    side.set(xlabel=f"time ({unit})", ylabel=axes[across])
+    _name_plane(plane, first, second)
+    side.set(title="Height" if across == 2 else "Across the plane of motion")
+    side.set(xlabel=f"time ({unit})", ylabel=_AXIS_LABELS[across])
     # Show at least half a metre: on a flat road, rounding would look like hills.
     low, high = side.get_ylim()
     if high - low < 0.5:
@@ -374,22 +384,15 @@ def _figure_of_track(
     colours = (CHILD, PARENT)
     if evidence.has_positions_of_parent:
         colours = (PARENT, CHILD)
+    unmoved = moved_onto(turn, without_lever_arm[part])
+    moved = moved_onto(turn, computed[part])
     paths = (
-        (
-            moved_onto(turn, without_lever_arm[part]),
-            MUTED,
-            f"{other}, no lever arm",
-        ),
-        (
-            moved_onto(turn, computed[part]),
-            colours[1],
-            f"{other}, through the result",
-        ),
+        (unmoved, MUTED, f"{other}, no lever arm"),
+        (moved, colours[1], f"{other}, through the result"),
     )
     factor, unit = _time_axis(evidence.times_s[-1])
     times = evidence.times_s[part] * factor
-    across = int(np.argmin(np.ptp(measured, axis=0)))
-    first, second = (axis for axis in range(3) if axis != across)
+    first, second, _ = _axes_of_motion(measured)
     figure, (plane, side) = make_panels(3.75, 1, 2)
     distances = []
     for path, colour, label in paths:
@@ -412,10 +415,7 @@ def _figure_of_track(
         ms=3.5,
         label=plain_label(sensor),
     )
-    axes = ("x (m)", "y (m)", "z (m)")
-    plane.set(title="From above" if across == 2 else "In the plane of motion")
-    plane.set(xlabel=axes[first], ylabel=axes[second])
-    plane.set_aspect("equal", adjustable="datalim")
+    _name_plane(plane, first, second)
     side.set(title="Distance from the measured positions")
     side.set(xlabel=f"time ({unit})", ylabel="distance (cm)", ylim=(0, None))
     caption = (

@@ -166,15 +166,7 @@ def render(
     """
     inputs = inputs or {}
     command = calibration.static_transform_command()
-    calibration = replace(
-        calibration,
-        parent_frame=_sensor_name(
-            calibration.parent_frame, inputs.get("parent", {})
-        ),
-        child_frame=_sensor_name(
-            calibration.child_frame, inputs.get("child", {})
-        ),
-    )
+    calibration = _with_sensor_names(calibration, inputs)
     parent = printable(calibration.parent_frame)
     child = printable(calibration.child_frame)
     evidence = gather(calibration, snapshot) if snapshot else None
@@ -295,6 +287,21 @@ def _kind_of_result(calibration: Calibration) -> str:
     if unknown >= {*ROTATIONS}:
         return "Position"
     return "Orientation" if unknown >= {*TRANSLATIONS} else "Pose"
+
+
+def _with_sensor_names(
+    calibration: Calibration, inputs: Document
+) -> Calibration:
+    """Return the result with the names of its sensors as frames."""
+    return replace(
+        calibration,
+        parent_frame=_sensor_name(
+            calibration.parent_frame, inputs.get("parent", {})
+        ),
+        child_frame=_sensor_name(
+            calibration.child_frame, inputs.get("child", {})
+        ),
+    )
 
 
 def _sensor_name(frame: str, origin: Document) -> str:

@@ -12,16 +12,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import (
-    Excitation,
-    axes_by_hand,
-    what_is_missing,
-)
+from hand_eye_calib.core.assessment.excitation import Excitation
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import plain
-from hand_eye_calib.core.base.spelling import Interface
-from hand_eye_calib.core.base.text import duration, in_sentences, parse_targets
+from hand_eye_calib.core.base.text import duration, parse_targets
 from hand_eye_calib.core.engine.attempts import with_options
 from hand_eye_calib.core.engine.calibrator import Calibrator
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
@@ -30,19 +25,18 @@ from hand_eye_calib.core.results.calibration import (
     SolveStatus,
     Verdict,
 )
-from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.online.live.describing import (
-    NO_PAIRS,
+    advice_after_failure,
+    comparison_of,
     describe,
-    has_just_begun,
     is_held_up,
     is_refuted,
     is_too_little,
     priors_of,
+    refuted_in_words,
     slow_in_words,
     state_of_result,
     too_little_in_words,
-    with_axis_keys,
     with_newest_halves,
 )
 from hand_eye_calib.online.live.goal import Goal, no_result_in_words
@@ -67,11 +61,7 @@ from hand_eye_calib.online.live.state import (
     ProgressState,
     Standing,
 )
-from hand_eye_calib.online.live.stream_checks import (
-    RAW_POSE_CODES,
-    StreamChecks,
-    merged,
-)
+from hand_eye_calib.online.live.stream_checks import StreamChecks
 
 # Callback that receives the success of a solve and a line of text about the result.
 OnSolved: TypeAlias = Callable[[bool, str], None]
@@ -82,10 +72,6 @@ _CHECK_PERIOD_S = 30.0
 # Shortest time between two stream checks, as a multiple of the duration of a solve. A check
 # prolongs a solve by a half. So on a busy computer most solves have no check.
 _SOLVES_PER_CHECK = 4.0
-
-# Streams without pairs have a fault if each has at least this number of poses; with fewer, they
-# have just begun.
-_MANY_UNPAIRED = 50
 
 # Options that change the verdict on a result, but not the result.
 _TARGETS = ("target_translation", "target_rotation", "target_axes")
@@ -238,15 +224,7 @@ class SolveCycle:
         if result is None:
             return ""
         if is_refuted(result):
-            reason = result.reasons[0]
-            remedy = (
-                ", or remove it"
-                if result.status is SolveStatus.CONTRADICTED
-                else ""
-            )
-            return (
-                f"{reason.sentence}; {reason.advice_on(Interface.NODE)}{remedy}"
-            )
+            return refuted_in_words(result)
         if failure is None or self._failing_since_s is None:
             return ""
         now_s = time.monotonic()
@@ -395,24 +373,11 @@ class SolveCycle:
         return self._take(self._complete(newest))
 
     def _advice_after_failure(self) -> tuple[str, tuple[str, ...]]:
-        """Return advice after a failed solve, and axes that may be measured by hand.
-
-        After a short motion, the advice is to continue. Later the advice names the missing motion,
-        or else the reason of the failure.
-        """
-        motion = self._motion
+        """Return advice after a failed solve, and axes that may be measured by hand."""
         statistics = map(self._session.calibrator.statistics, STREAMS)
         n_received = min(stream.received for stream in statistics)
-        if not motion.n_poses and n_received >= _MANY_UNPAIRED:
-            return NO_PAIRS, ()
-        if has_just_begun(motion):
-            return too_little_in_words(motion), ()
-        if missing := what_is_missing(motion):
-            return in_sentences(missing), axes_by_hand(
-                motion.hidden_axes(), motion
-            )
         failure = self._failure.what if self._failure is not None else ""
-        return in_sentences(failure), ()
+        return advice_after_failure(self._motion, n_received, failure)
 
     def _with_warnings(self, calibration: Calibration) -> Calibration:
         """Return a calibration with findings and warnings of the session; log the warnings."""
@@ -421,7 +386,8 @@ class SolveCycle:
         )
         for warning in warnings:
             self._log.warning(warning)
-        return self._with_findings(replace(calibration, warnings=warnings))
+        warned = replace(calibration, warnings=warnings)
+        return self.checks.with_findings(warned)
 
     def _take_motion(self, answer: Answer) -> None:
         """Store motion and clock offset of an answer."""
@@ -484,29 +450,11 @@ class SolveCycle:
             self._log.info(f"{reason}: {describe(newest)}", ONCE_S, key="kept")
             result = replace(result, warnings=(*result.warnings, reason))
             result = with_newest_halves(result, newest)
-        result = self._with_findings(result)
+        result = self.checks.with_findings(result)
         self._set_result(result)
         every_s = GOES_ON_S if progress.done == was_done else 0.0
         text = self._results.result(result, progress, every_s)
         return result.status is SolveStatus.OK, text
-
-    def _with_findings(self, calibration: Calibration) -> Calibration:
-        """Return the calibration with the findings of the stream checks.
-
-        A calibration from positions, rotations or rates has findings of its own. Only findings
-        about the received poses are added to these.
-        """
-        findings = self.checks.findings
-        if calibration.measured != "poses":
-            raw = [
-                finding
-                for finding in findings
-                if finding.code in RAW_POSE_CODES
-            ]
-            findings = merged(calibration.findings, raw)
-        if calibration.findings == findings:
-            return calibration
-        return replace(calibration, findings=findings)
 
     # -------------------------------------------------------------------- state
 
@@ -641,15 +589,5 @@ class SolveCycle:
             text=text,
             is_paused=bool(why_paused),
             progress=progress,
-            comparison=self._comparison(why_not_compared),
-        )
-
-    def _comparison(self, why_not: str) -> Comparison | None:
-        """Return the comparison with the installed transform, or the reason why it is missing."""
-        if self.result is not None and self.result.comparison is not None:
-            return with_axis_keys(self.result.comparison)
-        return (
-            Comparison(sentence=f"not compared yet: {why_not}")
-            if why_not
-            else None
+            comparison=comparison_of(self.result, why_not_compared),
         )

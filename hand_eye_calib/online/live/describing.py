@@ -5,13 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from hand_eye_calib.core.assessment.excitation import Excitation
+from hand_eye_calib.core.assessment.excitation import (
+    Excitation,
+    axes_by_hand,
+    what_is_missing,
+)
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.spelling import Interface
-from hand_eye_calib.core.base.text import duration, listing
+from hand_eye_calib.core.base.text import duration, in_sentences, listing
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.core.results.context import Comparison
 from hand_eye_calib.core.results.parts import facts_of
 from hand_eye_calib.core.results.records import AXES
@@ -32,6 +36,10 @@ _MIN_ROTATION_RAD = float(np.radians(30.0))
 
 # Advice while both streams have poses that cannot be paired.
 NO_PAIRS = "The poses of both sensors do not pair. Compare their clocks and their rates."
+
+# Streams without pairs have a fault if each has at least this number of poses; with fewer, they
+# have just begun.
+_MANY_UNPAIRED = 50
 
 # Solves that take longer than this (s) are reported, because advice and time left then refer to
 # older data.
@@ -96,6 +104,33 @@ def too_little_in_words(motion: Excitation) -> str:
     )
 
 
+def advice_after_failure(
+    motion: Excitation, n_received: int, failure: str
+) -> tuple[str, tuple[str, ...]]:
+    """Return advice after a failed solve, and axes that may be measured by hand.
+
+    After a short motion, the advice is to continue. Later the advice names the missing motion, or
+    else the reason of the failure.
+
+    Parameters
+    ----------
+    motion : Excitation
+        Motion of the session.
+    n_received : int
+        Poses of the stream with fewer poses.
+    failure : str
+        Reason of the failure.
+    """
+    if not motion.n_poses and n_received >= _MANY_UNPAIRED:
+        return NO_PAIRS, ()
+    if has_just_begun(motion):
+        return too_little_in_words(motion), ()
+    if missing := what_is_missing(motion):
+        by_hand = axes_by_hand(motion.hidden_axes(), motion)
+        return in_sentences(missing), by_hand
+    return in_sentences(failure), ()
+
+
 def is_held_up(seconds: float, processor_s: float) -> bool:
     """Return whether a solve took long, and waited for the processor most of this time."""
     return seconds >= _SLOW_SOLVE_S and processor_s < _BUSY_SHARE * seconds
@@ -138,6 +173,17 @@ def with_newest_halves(kept: Calibration, newest: Calibration) -> Calibration:
     return replace(kept, cross_check=rows)
 
 
+def comparison_of(
+    result: Calibration | None, why_not: str
+) -> Comparison | None:
+    """Return the comparison with the installed transform, or the reason why it is missing."""
+    if result is not None and result.comparison is not None:
+        return with_axis_keys(result.comparison)
+    if not why_not:
+        return None
+    return Comparison(sentence=f"not compared yet: {why_not}")
+
+
 def with_axis_keys(comparison: Comparison) -> Comparison:
     """Return the comparison, with the axis names of topics (``AXIS_KEYS``) in its differences."""
     differences = []
@@ -152,6 +198,15 @@ def is_refuted(result: Calibration) -> bool:
     return bool(result.status.failure) or any(
         finding.makes_unusable for finding in result.findings
     )
+
+
+def refuted_in_words(result: Calibration) -> str:
+    """Return why a result is refuted, and what to do, in one line."""
+    reason = result.reasons[0]
+    text = f"{reason.sentence}; {reason.advice_on(Interface.NODE)}"
+    if result.status is SolveStatus.CONTRADICTED:
+        text += ", or remove it"
+    return text
 
 
 def priors_of(config: CalibratorConfig) -> dict[str, str]:

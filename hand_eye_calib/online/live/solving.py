@@ -37,9 +37,13 @@ from hand_eye_calib.core.checks.check import (
 )
 from hand_eye_calib.core.checks.findings import Finding, answered
 from hand_eye_calib.core.checks.streams import check_positions, check_stream
-from hand_eye_calib.core.engine.attempts import with_options
+from hand_eye_calib.core.engine.attempts import (
+    check,
+    with_open_errors,
+    with_options,
+)
 from hand_eye_calib.core.engine.calibrator import Calibrator
-from hand_eye_calib.core.engine.run import check, review, with_open_errors
+from hand_eye_calib.core.engine.run import review
 from hand_eye_calib.core.engine.snapshot import STREAMS, Snapshot
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from hand_eye_calib.core.checks.findings import (
     answered,
     gravest_first,
 )
-from hand_eye_calib.core.engine.run import with_open_errors
+from hand_eye_calib.core.engine.attempts import with_open_errors
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.online.live.brief import step_after
 from hand_eye_calib.online.live.log import NodeLog
@@ -99,6 +100,24 @@ class StreamChecks:
             if self._result is None
             else with_open_errors(calibration, self._result)
         )
+
+    def with_findings(self, calibration: Calibration) -> Calibration:
+        """Return a calibration with the findings that the session reports.
+
+        A calibration from positions, rotations or rates has findings of its own. Only findings
+        about the received poses are added to these.
+        """
+        findings = self.findings
+        if calibration.measured != "poses":
+            raw = [
+                finding
+                for finding in findings
+                if finding.code in RAW_POSE_CODES
+            ]
+            findings = merged(calibration.findings, raw)
+        if calibration.findings == findings:
+            return calibration
+        return replace(calibration, findings=findings)
 
     @property
     def findings(self) -> tuple[Finding, ...]:

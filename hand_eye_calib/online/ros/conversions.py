@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.results.calibration import Calibration
 
 # Length of a queue of messages: several seconds of a fast stream. For /tf_static, it is the number

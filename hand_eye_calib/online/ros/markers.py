@@ -10,7 +10,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.text import AXIS_UNITS
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.geometry.se3 import turned
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.ros.conversions import fill, to_time

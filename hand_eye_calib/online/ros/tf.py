@@ -24,12 +24,12 @@ from hand_eye_calib.core.base.errors import (
 )
 from hand_eye_calib.core.base.text import axes_in_words
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.covariances import turned
 from hand_eye_calib.core.geometry.frames import (
     Extrinsic,
     FrameTree,
     checked_pose,
 )
-from hand_eye_calib.core.geometry.se3 import turned
 from hand_eye_calib.core.results.calibration import Calibration, Verdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
 from hand_eye_calib.formats.bags.messages import transform_of

@@ -26,6 +26,7 @@ from hand_eye_calib.online.live.brief import (
 from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.state import (
     ChecksState,
+    ExtrinsicState,
     InputState,
     Level,
     MountState,
@@ -153,15 +154,7 @@ def _conditions(state: NodeState) -> Iterator[_Condition]:
     )
     extrinsic = state.extrinsic
     if extrinsic and extrinsic.contradicted:
-        axes = axes_in_words(extrinsic.contradicted)
-        yield _Condition(
-            Tone.BAD,
-            CHECK_VALUE,
-            Level.WARN,
-            extrinsic,
-            "Correct it (value, unit, sign), or remove it.",
-            text=f"the value typed in for {axes} contradicts the motion",
-        )
+        yield _of_priors(extrinsic)
     for stream in inputs:
         yield _Condition(
             Tone.BAD,
@@ -195,6 +188,19 @@ def _conditions(state: NodeState) -> Iterator[_Condition]:
             text="the newest solves fail, and the result is older",
         )
     yield _Condition(Tone.ACT, "NOT WATCHING", Level.WARN, state.mount)
+
+
+def _of_priors(extrinsic: ExtrinsicState) -> _Condition:
+    """Return the condition that the motion contradicts priors."""
+    axes = axes_in_words(extrinsic.contradicted)
+    return _Condition(
+        Tone.BAD,
+        CHECK_VALUE,
+        Level.WARN,
+        extrinsic,
+        "Correct it (value, unit, sign), or remove it.",
+        text=f"the value typed in for {axes} contradicts the motion",
+    )
 
 
 def _of_input(stream: InputState, state: NodeState) -> _Condition:
