@@ -113,6 +113,7 @@ def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
         (["--params-file {folder}/broken.yaml"], 1, "{folder}/broken.yaml"),
         (["--params-file {folder}/absent.yaml"], 1, "{folder}/absent.yaml"),
         (["--no-such-option"], 2, "no-such-option"),
+        (["-r parent_odom=/lidar"], 1, "write -r FROM:=TO"),
         (
             [
                 "-p parent_type:=nav_msgs/msg/Odometry",

@@ -140,7 +140,8 @@ class SessionJournal:
         self.error = reason
         self._log.warning(
             f"cannot write the session journal in {self.directory}: {reason}; "
-            "no journal until ~/reset, so a crash would lose this session"
+            "no journal until ~/reset (make the directory writable first), so a crash would lose "
+            "this session"
         )
 
     # ------------------------------------------------------------ in the thread

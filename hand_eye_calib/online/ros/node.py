@@ -76,11 +76,35 @@ def _init(arguments: list[str]) -> int:
     except UnknownROSArgsError as error:
         return fail(f"unknown ROS arguments {error}", 2)
     except RCLError as error:
-        return fail(
-            re.sub(r", at \S+:\d+", "", " ".join(str(error).split())), 1
-        )
+        return fail(_in_words(str(error)), 1)
     set_logger_level("rcl", LoggingSeverity.UNSET)
     return 0
+
+
+# Messages of rcl: a rule without the sign := or with a wrong name, and a parameter file.
+_WRONG_RULE = re.compile(
+    r"Couldn't parse (\w+) (?:\w+ )?rule: '(-+\S+) ([^']*)'"
+)
+_WRONG_FILE = re.compile(
+    r"Couldn't parse params file: '\S+ ([^']*)'\. Error: (.*)"
+)
+
+
+def _in_words(error: str) -> str:
+    """Return an error of rcl about the arguments in one line, with the right form of a rule."""
+    text = re.sub(r", at \S+:\d+", "", " ".join(error.split()))
+    if rule := _WRONG_RULE.search(text):
+        form = "FROM:=TO" if rule[1] == "remap" else "NAME:=VALUE"
+        return (
+            f"cannot read {rule[2]} {rule[3]}: write {rule[2]} {form}; names consist of letters, "
+            "digits, _ and /"
+        )
+    if file := _WRONG_FILE.search(text):
+        return (
+            f"cannot read the parameter file {file[1]}: {file[2]}; check the path, and compare the "
+            "file with config/calibrator.yaml of the package"
+        )
+    return text
 
 
 def _run_node(signals: int) -> int:
