@@ -4,6 +4,7 @@ Its source is a robot description, an earlier result, a file of another program,
 """
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -73,8 +74,14 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
         try:
             values = parse_pose("installed", text)
         except ConfigError:
-            if len(text.split()) == len(AXES):
+            words = text.split()
+            if len(words) == len(AXES):
                 raise
+            are_numbers = all(re.fullmatch(r"-?[\d.]+", word) for word in words)
+            if len(words) > 1 and are_numbers:
+                raise ConfigError(
+                    f"installed: {len(words)} numbers; X Y Z ROLL PITCH YAW are {len(AXES)}"
+                ) from None
             raise ConfigError(
                 f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
                 "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"

@@ -341,6 +341,21 @@ def test_units_in_the_names_of_columns(tmp_path, header, units):
     assert read.poses == pytest.approx(expected.poses)
 
 
+def test_the_order_of_columns_and_decimal_commas_are_read(tmp_path):
+    columns = {"t": [0.0, 0.02], "left": [1.5, 2.5], "right": [1.0, 3.0]}
+    stamps_ns = np.arange(2) * 20_000_000
+    values = np.column_stack([columns["left"], columns["right"]])
+    path = tmp_path / "wheels.csv"
+    lines = ["t;right_rad_s;left_rad_s"]
+    for stamp, left, right in zip(*columns.values(), strict=True):
+        lines.append(f"{stamp};{right};{left}".replace(".", ","))
+    path.write_text("\n".join(lines), encoding="utf-8")
+    with pytest.warns(UserWarning, match="by its columns"):
+        read = hec.read_trajectory(path)
+    expected = hec.wheel_trajectory(stamps_ns, values, "wheels")
+    assert read.poses == pytest.approx(expected.poses)
+
+
 def twists(drive):
     """Velocities of an omnidirectional machine."""
     vector = JAZZY.types["geometry_msgs/msg/Vector3"]

@@ -146,7 +146,7 @@ TABLE = """
 1 | compare saved --with other.json | in it; pass extrinsic.yaml, a URDF, a bag, or "X Y
 1 | compare saved --with lidar.tum | an installed transform is one pose
 1 | compare saved --with robot.urdf | in the robot description; it has no transforms
-2 | compare saved --with "1 2 3 4 5" | expected a URDF, extrinsic.yaml, a bag, or X Y Z
+2 | compare saved --with "1 2 3 4 5" | 5 numbers; X Y Z ROLL PITCH YAW are 6
 2 | export saved urdff | did you mean urdf?
 2 | simulate --out new --drive hily | did you mean hilly?
 2 | check | got 0: for example, hand_eye_calib check sample:lidar.tum sample:camera.tum
@@ -165,6 +165,19 @@ TABLE = """
 2 | check lidar.tum camera.tum --vehicle x | --vehicle is an option of batch: hand_eye_calib batch
 2 | info saved --with a.urdf | compare: hand_eye_calib compare RESULT ... --with a.urdf
 2 | compare saved --out x | --out is an option of calibrate
+2 | calibrate lidar.tum camera.tum --force | unknown '--force' (
+2 | calibrate lidar.tum --topic /a | unknown '--topic'; did you mean --parent-topic?
+2 | calibrate lidar.tum camera.tum --method DNLO | did you mean dnlo?
+2 | calibrate lidar.tum camera.tum --json out.json | end the command with > out.json
+2 | export saved urdf out.urdf | end the command with > out.urdf
+2 | calibrate lidar.tum camera.tum --target-rotation 0.3 | write 0.3deg for degrees
+2 | arm arm.yaml hand.tum | arm.yaml has the samples of both sides: pass it alone
+2 | help calibrate | write hand_eye_calib COMMAND --help
+2 | calibrate lidar.tum camera.tum --prior z=1,85+/-0,02 | got '1,85'; write 1.85
+2 | calibrate ticks.zip | ticks.zip is an archive: unpack it
+2 | calibrate bag/metadata.yaml | describes a bag: pass its folder, bag
+1 | calibrate ticks.csv lidar.tum | left_ticks has counts of an encoder: convert them to speeds
+1 | calibrate oneside.csv lidar.tum | wheels need a column of the left and one of the right
 2 | calibrate lidar.tum camera.tum --foobar | unknown '--foobar' (
 2 | calibrate lidar.tum camera.tum --foo | unknown '--foo' (
 2 | calibrate lidar.tum camera.tum -o x | unknown '-o'; did you mean --out? (
@@ -199,6 +212,9 @@ ROWS = [
 
 TEXTS = {
     "empty.tum": "",
+    "ticks.zip": "PK",
+    "ticks.csv": "t,left_ticks,right_ticks\n0,1,1\n1,1,1\n",
+    "oneside.csv": "t,left_rad_s\n0,1\n1,1\n",
     "nothing.yaml": "",
     "comment.tum": "# nothing\n",
     "one.tum": "0 0 0 0 0 0 0 1\n",
@@ -411,6 +427,22 @@ IN_PYTHON = {
     "a matrix as installed": (
         lambda: hec.compare([RESULT], installed=np.eye(3)),
         "installed must be an earlier result, such as hec.load(DIR); got ndarray",
+    ),
+    "a result without a list": (
+        lambda: hec.compare(RESULT, RESULT),
+        "got Calibration: pass a list of results",
+    ),
+    "paths as results": (
+        lambda: hec.compare(["a", "b"]),
+        "got str: read a saved result with hand_eye_calib.load",
+    ),
+    "a list as a rig": (
+        lambda: hec.calibrate_rig(["a.tum", "b.tum", "c.tum"]),
+        "pass {name: trajectory} of all sensors",
+    ),
+    "a bag without a topic": (
+        lambda: hec.read_trajectory("sample:drive.mcap"),
+        "is a bag: name the topic of the bag",
     ),
     "one result": (
         lambda: hec.compare([RESULT]),

@@ -85,7 +85,7 @@ class TestOptionsOfCalibrate:
             f"keyframe_min_{quantity}"
             for quantity in ("translation", "rotation", "interval")
         ]
-        numbers += ["target_translation", "target_rotation"]
+        numbers += ["target_translation"]
         numbers_given = {name: 0.0625 * k for k, name in enumerate(numbers, 1)}
         numbers_given |= dict(
             method="dnl",
@@ -93,6 +93,7 @@ class TestOptionsOfCalibrate:
             backend="ipopt",
             min_pairs=4,
             max_pairs=77,
+            target_rotation=0.1,
         )
         numbers_given |= dict(time_offset="estimate", target_axes="z=0.1")
         numbers_given |= dict(

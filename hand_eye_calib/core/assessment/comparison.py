@@ -65,9 +65,14 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
-    require_type("results", results, Sequence)
+    require_type("results", results, Sequence, remedy="pass a list of results")
     for result in results:
-        require_type("each result", result, Calibration)
+        require_type(
+            "each result",
+            result,
+            Calibration,
+            remedy="read a saved result with hand_eye_calib.load",
+        )
     if installed is not None and not isinstance(
         installed, Calibration | Extrinsic
     ):

@@ -334,7 +334,7 @@ class CalibratorConfig(OptionSet):
         "Standard deviation about each axis that is good enough, by default "
         "0.3 deg, for the verdict and the stop rule.",
         unit="rad",
-        within=(1e-6, math.pi),
+        within=(1e-6, 0.2),
     )
     target_axes: str = option(
         "",

@@ -76,13 +76,14 @@ class MissingDependencyError(HandEyeCalibError, ImportError):
     """An optional package that this request needs is not installed."""
 
 
-def require_type(name: str, value: object, *kinds: type) -> None:
+def require_type(
+    name: str, value: object, *kinds: type, remedy: str = ""
+) -> None:
     """Raise InputError if an argument of the Python interface is of none of these types."""
     if not isinstance(value, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
-        raise InputError(
-            f"{name} must be of type {expected}; got {type(value).__name__}"
-        )
+        text = f"{name} must be of type {expected}; got {type(value).__name__}"
+        raise InputError(f"{text}: {remedy}" if remedy else text)
 
 
 @contextmanager

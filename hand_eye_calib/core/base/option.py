@@ -88,8 +88,15 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     """
     import difflib
 
-    similar = difflib.get_close_matches(word, list(candidates), n=3, cutoff=0.6)
-    if not similar:
+    candidates = list(candidates)
+    for spelling in (word, word.lower()):
+        similar = difflib.get_close_matches(
+            spelling, candidates, n=3, cutoff=0.62
+        )
+        if similar:
+            word = spelling
+            break
+    else:
         return ""
     n_edits = {
         candidate: _count_edits(word, candidate) for candidate in similar
@@ -231,8 +238,9 @@ def _checked_number(field: OptionField, value: float) -> float:
     if not low <= value <= high:
         bound = f"at least {low}" if value < low else f"at most {high}"
         unit = field.metadata["unit"]
+        hint = f"; write {value:g}deg for degrees" if unit == "rad" else ""
         raise ConfigError(
-            f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}"
+            f"{name} must be {' '.join([bound, unit]).rstrip()}; got {value}{hint}"
         )
     return value
 

@@ -428,8 +428,10 @@ def _quantity(name: str, unit: str, word: str) -> float:
     unit_of_word = _unit_of(word) or unit
     if not match or unit_of_word not in factors:
         allowed = " or ".join(factors)
+        point = word.replace(",", ".")
+        hint = f"; write {point}" if _QUANTITY.fullmatch(point) else ""
         raise ConfigError(
-            f"{name} must be numbers in {allowed}; got {shown_value(word)}"
+            f"{name} must be numbers in {allowed}; got {shown_value(word)}{hint}"
         )
     value = float(match[1]) * factors[unit_of_word]
     if abs(value) > _MAX_TYPED:

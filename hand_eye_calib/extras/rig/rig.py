@@ -217,9 +217,19 @@ def _require_rig(
     trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]
 ) -> None:
     """Raise an InputError for unusable trajectories, a ConfigError for options of two sensors."""
-    require_type("trajectories", trajectories, Mapping)
+    require_type(
+        "trajectories",
+        trajectories,
+        Mapping,
+        remedy="pass {name: trajectory} of all sensors",
+    )
     for trajectory in trajectories.values():
-        require_type("each trajectory", trajectory, Trajectory)
+        require_type(
+            "each trajectory",
+            trajectory,
+            Trajectory,
+            remedy="read a file with hand_eye_calib.read_trajectory",
+        )
     if len(trajectories) < 3:
         raise InputError(
             f"a rig needs at least three sensors; found {len(trajectories)}: "

@@ -45,6 +45,10 @@ SolvedInput: TypeAlias = tuple[
 ]
 
 
+# Ends of files that contain the poses of robot and camera.
+_OF_BOTH_SIDES = (".yaml", ".yml", ".samples")
+
+
 def solved(arguments: Namespace) -> SolvedInput:
     """Calibrate from the stops that the arguments name.
 
@@ -78,6 +82,11 @@ def solved(arguments: Namespace) -> SolvedInput:
             "--order none takes two trajectory files, or the samples of an arm"
         )
     refuse_repeated_paths(paths)
+    for path in paths:
+        if path.suffix in _OF_BOTH_SIDES:
+            raise ConfigError(
+                f"{path} has the samples of both sides: pass it alone"
+            )
     arguments.pair_by = arguments.pair_by or "row"
     return _from_two_files(arguments, config, options)
 

@@ -4,7 +4,8 @@ The unit vehicle has wheels of radius 1, see :mod:`.wheels`.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,9 @@ _UNITS = {
     "kmh": 1.0 / 3.6,
     "mm_s": 1e-3,
 }
+
+# Ends of the names of columns with counts of an encoder.
+_COUNTS = ("ticks", "counts", "pulses", "encoder")
 
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
@@ -184,32 +188,70 @@ def table_of_wheels(
         .lower()
         .replace(" ", "")
     )
-    stamp, _, names = line.partition(",")
-    kinds = [
-        kind
-        for pattern, kind in _COLUMNS.items()
-        if re.fullmatch(pattern, names)
-    ]
-    if not kinds:
+    # With semicolons between the cells, decimal commas are allowed.
+    separator = ";" if ";" in first_line else ","
+    stamp, *names = line.replace(";", ",").split(",")
+    kind, order = _kind_and_order(path, names)
+    if not kind:
         return None
     rows = []
     for line_number, text in enumerate(data.decode().splitlines(), 1):
         # Without the option `columns`, the first line has the names.
         if text.strip() and (line_number > 1 or options.columns):
-            rows.append((line_number, [*text.split(","), "0"]))
+            cells = [cell.replace(",", ".") for cell in text.split(separator)]
+            if len(cells) > len(names):
+                values_in_order = [cells[1 + column] for column in order]
+                cells = [cells[0], *values_in_order]
+            rows.append((line_number, [*cells, "0"]))
     # The table reads three values as positions. A zero at the end replaces a missing third value.
-    n_values = names.count(",") + 1
+    n_values = len(names)
     rates = Table(path, (stamp, "x", "y", "z"), "positions")
     rates.fill(rows, lambda cells: cells[:4])
     values = rates.values()[:, :n_values] * [
-        _unit_of(name) for name in names.split(",")
+        _unit_of(names[column]) for column in order
     ]
     wheels = wheel_trajectory(
-        stamps_in_ns(rates, options.stamp_unit), values, kinds[0]
+        stamps_in_ns(rates, options.stamp_unit), values, kind
     )
     table = Table(
         path, (stamp, *_POSE), "poses", sensor_frame=wheels.sensor_frame
     )
     table.fill_from_arrays(se3.to_rows(wheels.poses), rates.stamps)
-    table.measures = kinds[0]
+    table.measures = kind
     return table
+
+
+def _kind_and_order(
+    path: str | Path, names: Sequence[str]
+) -> tuple[str, Sequence[int]]:
+    """Return the kind of wheel data, and its columns in the order of this kind.
+
+    ``names`` are those of the columns after the stamps. The kind is empty for other data.
+
+    Raises
+    ------
+    InputError
+        If the columns have counts of encoders, or a column of one wheel alone.
+    """
+    if len(names) == 1 and re.fullmatch(r"(left|right)\w*", names[0]):
+        raise InputError(
+            f"{path}: wheels need a column of the left and one of the right; found {names[0]}"
+        )
+    if len(names) not in _N_COLUMNS.values():
+        return "", ()
+    for pattern, kind in _COLUMNS.items():
+        for order in permutations(range(len(names))):
+            if re.fullmatch(pattern, ",".join(names[i] for i in order)):
+                _refuse_counts(path, names)
+                return kind, order
+    return "", ()
+
+
+def _refuse_counts(path: str | Path, names: Iterable[str]) -> None:
+    """Raise an InputError if a column has counts of an encoder, by its name."""
+    for name in names:
+        if name.endswith(_COUNTS):
+            raise InputError(
+                f"{path}: {name} has counts of an encoder: convert them to speeds in rad/s, "
+                "2 pi * counts in a row / counts of a turn / seconds in a row"
+            )

@@ -25,6 +25,7 @@ from hand_eye_calib.core.base.text import (
     without_poses,
 )
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.trajectory_files.file_options import (
@@ -174,10 +175,11 @@ def _refuse_misplaced_options(
 
     ``path`` is the text file to read, or None for an object.
     """
-    if path and path.is_dir():
+    if path and (path.is_dir() or has_suffix_of_bag(path)):
         refuse_saved_result(path)
+        kind = "folder" if path.is_dir() else "bag"
         raise ConfigError(
-            f"{path} is a folder: name the topic of the bag, such as topic='/odom'"
+            f"{path} is a {kind}: name the topic of the bag, such as topic='/odom'"
         )
     has_unusable_options = has_times_in_memory if path else has_file_options
     if has_unusable_options:

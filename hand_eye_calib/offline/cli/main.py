@@ -186,6 +186,8 @@ def _run(argv: Sequence[str]) -> int:
     )
     if command is not None and command not in COMMANDS:
         known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
+        if command == "help":
+            parser.error("write hand_eye_calib COMMAND --help")
         if line := calibrating(argv):
             parser.error(
                 f"{command!r} is a path; a command comes first: {line}"
@@ -199,7 +201,8 @@ def _run(argv: Sequence[str]) -> int:
         _refuse_repeated(parsers[command], argv)
     arguments, rest = parser.parse_known_args(argv)
     if rest and command != "calibrator":
-        if message := misplaced(arguments.command, rest):
+        flags = [word for word in argv if word.startswith("-")]
+        if message := misplaced(arguments.command, rest, flags):
             parsers[arguments.command].error(message)
         _refuse(rest, parsers.get(command or "", parser))
     if arguments.version:
@@ -284,8 +287,8 @@ def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
     parser.error(f"unknown {option!r}{hint}")
 
 
-# Options of other programs with one letter, and the options here with the same purpose.
-_SHORT_NAMES = {"-o": "--out"}
+# Options of other programs, and the options here with the same purpose.
+_SHORT_NAMES = {"-o": "--out", "--topic": "--parent-topic"}
 
 
 def _commands_with(option: str) -> dict[str, argparse.ArgumentParser]:

@@ -5,7 +5,7 @@ Each of them gets an error with the command that the user meant.
 
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -30,6 +30,10 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
     from hand_eye_calib.offline.cli.reading import is_plain_file
 
     for path in paths:
+        if Path(path).name == "metadata.yaml":
+            raise ConfigError(
+                f"{path} describes a bag: pass its folder, {Path(path).parent}"
+            )
         names = re.split(r"[\s,]+", str(path).strip(" ,"))
         are_several = len(names) > 1 and not Path(path).exists()
         if are_several and all(Path(name).exists() for name in names):
@@ -62,11 +66,21 @@ def calibrating(words: Sequence[str]) -> str:
     return f"hand_eye_calib {command} {shlex.join(words)}"
 
 
-def misplaced(command: str, rest: Sequence[str]) -> str:
-    """Return the error about the first unused argument of a command, if its purpose is clear."""
+def misplaced(
+    command: str, rest: Sequence[str], flags: Collection[str] = ()
+) -> str:
+    """Return the error about the first unused argument of a command, if its purpose is clear.
+
+    ``flags`` are the options before it that take no value.
+    """
     first = rest[0]
     if first.startswith("-"):
         return ""
+    if command == "export" or "--json" in flags or "--as" in flags:
+        return (
+            f"{first} has no meaning: the document is printed; to save it, end the command with "
+            f"> {shlex.quote(first)}"
+        )
     if re.match(rf"({'|'.join(AXIS_UNITS)})=", first):
         return f"{first} follows no option: repeat --prior before each axis"
     if command == "watch" and Path(first).exists():

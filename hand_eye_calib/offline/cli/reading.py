@@ -31,6 +31,8 @@ from hand_eye_calib.offline.cli.options import (
 if TYPE_CHECKING:
     from hand_eye_calib.formats.trajectory_files.file_options import FileOptions
 
+# Ends of the names of archives, which are not read.
+_ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz", ".tar.xz", ".7z", ".rar")
 # Options that only the method dnlo uses.
 _OPTIONS_OF_DNLO = ("threshold", "min_inlier_fraction")
 
@@ -117,6 +119,11 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
             f"{[*urls, *local_bags][0]} is a bag, and another path is not: "
             "pass two trajectory files, or the parts of one bag"
         )
+    for path in paths:
+        if str(path).lower().endswith(_ARCHIVES):
+            raise ConfigError(
+                f"{path} is an archive: unpack it, and pass the bag or the files in it"
+            )
     if len(paths) == 1:
         raise ConfigError(
             f"{paths[0]} is one trajectory file: pass those of two sensors, PARENT CHILD, or a bag"

@@ -265,6 +265,6 @@ def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise argparse.ArgumentTypeError(
-            f"expected PORT or HOST:PORT, got {text!r}"
+            f"expected PORT or HOST:PORT, got {text!r}; a port is at most 65535"
         )
     return host.strip("[]"), int(port)
