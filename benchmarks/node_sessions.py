@@ -173,20 +173,26 @@ def end_child(streams):
     streams.Ts_child = streams.Ts_child[keep]
 
 
-def nearest(times_s, wanted_s):
-    """Return the index of the pose that is nearest to each wanted time."""
-    return np.abs(times_s - wanted_s[:, None]).argmin(axis=1)
-
-
 def park(streams):
-    """Stand still from 25 to 55 s; the drive goes on from there."""
+    """Stand still from 25 to 55 s; the drive goes on from there.
+
+    Both sensors stand at their pose of the same instant, not at that of their nearest message.
+    """
     for name in ("parent", "child"):
         times_s = getattr(streams, f"{name}_s")
         Ts = getattr(streams, f"Ts_{name}")
         moving_s = np.where(
             times_s < 25.0, times_s, np.maximum(25.0, times_s - 30.0)
         )
-        setattr(streams, f"Ts_{name}", Ts[nearest(times_s, moving_s)])
+        # The poses before and after each wanted time.
+        after = np.searchsorted(times_s, moving_s).clip(1, len(times_s) - 1)
+        before = after - 1
+        share = (moving_s - times_s[before]) / (
+            times_s[after] - times_s[before]
+        )
+        setattr(
+            streams, f"Ts_{name}", se3.interpolate(Ts[before], Ts[after], share)
+        )
 
 
 def replace_start(streams, until_s, motion):
@@ -618,9 +624,12 @@ def compare_topics(witness, state, now_s):
         if values.get("verdict", result.verdict) != result.verdict:
             yield f"verdict {values['verdict']!r} on /diagnostics, {result.verdict!r} in the state"
     broadcast = newest(witness.broadcasts, now_s)
-    is_on = bool(state.extrinsic and state.extrinsic.tf_static is Broadcast.ON)
-    if is_on != bool(broadcast) and state.standing is Standing.CURRENT:
-        yield f"/tf_static is {state.extrinsic.tf_static.value}, transform sent: {bool(broadcast)}"
+    sending = state.extrinsic.tf_static if state.extrinsic else Broadcast.OFF
+    is_on = sending is Broadcast.ON
+    # A program that has received the transform keeps it when the node sends it no longer.
+    was_sent = sending in (Broadcast.ON, Broadcast.WITHDRAWN)
+    if was_sent != bool(broadcast) and state.standing is Standing.CURRENT:
+        yield f"/tf_static is {sending.value}, transform sent: {bool(broadcast)}"
     if is_on and broadcast and transform:
         (sent,) = broadcast[1].transforms
         if not np.allclose(matrix(sent), matrix(transform[1]), atol=1e-9):

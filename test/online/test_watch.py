@@ -421,6 +421,7 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     for broadcast, tone in (
         (Broadcast.ON, Tone.GOOD),
         (Broadcast.REFUSED, Tone.ACT),
+        (Broadcast.WITHDRAWN, Tone.ACT),
     ):
         extrinsic = replace(
             EXTRINSIC, tf_static=broadcast, tf_static_reason="why"

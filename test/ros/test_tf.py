@@ -213,7 +213,11 @@ class TestNode:
         assert broadcaster.state == (Broadcast.ON, "")
         faulty = "the streams are faulty"
         broadcaster.update(calibration, faulty)
-        assert broadcaster.state == (Broadcast.WAITING, faulty)
+        assert broadcaster.state == (Broadcast.WITHDRAWN, faulty)
+        broadcaster.update(None, "no result yet")
+        assert broadcaster.state == (Broadcast.WITHDRAWN, "no result yet")
+        broadcaster.update(calibration, "")
+        assert broadcaster.state == (Broadcast.ON, "")
         dofs = [*calibration.observability_measured]
         dofs[2] = dataclasses.replace(
             dofs[2], verdict=DofVerdict.UNOBSERVABLE, sigma=np.inf

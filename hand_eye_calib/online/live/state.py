@@ -56,6 +56,7 @@ class Broadcast(Enum):
     OFF = "off"
     WAITING = "not yet"
     ON = "broadcast"
+    WITHDRAWN = "withdrawn"
     REFUSED = "refused"
 
 

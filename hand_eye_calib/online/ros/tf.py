@@ -271,6 +271,8 @@ class TfBroadcaster:
         self._is_on = False
         self._began_s = 0.0
         self._publisher: Any = None
+        # Whether nodes may have received an edge that is no longer sent.
+        self._is_withdrawn = False
 
     def switch(self, on: bool) -> None:
         """Switch the broadcast on or off. A subscriber keeps the last edge until it restarts."""
@@ -299,13 +301,18 @@ class TfBroadcaster:
                 message_type(), STATIC_TOPIC, LATCHED
             )
         was_on = self.state[0] is Broadcast.ON
-        self.state = self._decide(result, why_not)
-        if result is not None and self.state[0] is Broadcast.ON:
+        broadcast, reason = self._decide(result, why_not)
+        if broadcast is Broadcast.WAITING and (was_on or self._is_withdrawn):
+            broadcast = Broadcast.WITHDRAWN
+        self.state = broadcast, reason
+        if result is not None and broadcast is Broadcast.ON:
+            self._is_withdrawn = False
             self._broadcast(result, not was_on)
         elif was_on:
             # Without a publisher, new subscribers do not receive the old edge.
             self._node.destroy_publisher(self._publisher)
             self._publisher = None
+            self._is_withdrawn = True
             self._log.warning(
                 "the edge on /tf_static is withdrawn; nodes that have received it keep it until "
                 "they restart"

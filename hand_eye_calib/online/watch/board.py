@@ -49,7 +49,14 @@ _ANSWER_FOR_S = 20.0
 _TONES: dict[object, Tone] = {
     **dict.fromkeys((Level.OK, "USE", "same", Broadcast.ON), Tone.GOOD),
     **dict.fromkeys(
-        (Level.WARN, "USE WITH CARE", "moved", Broadcast.REFUSED), Tone.ACT
+        (
+            Level.WARN,
+            "USE WITH CARE",
+            "moved",
+            Broadcast.REFUSED,
+            Broadcast.WITHDRAWN,
+        ),
+        Tone.ACT,
     ),
     **dict.fromkeys((Level.ERROR, "DO NOT USE"), Tone.BAD),
     Broadcast.WAITING: Tone.BUSY,
