@@ -344,13 +344,20 @@ def read_urdf(path: str | Path) -> FrameTree:
     InputError
         If the file cannot be read, is not a URDF file, or contains macros of xacro.
     """
+    _, frames = read_robot(path)
+    return frames
+
+
+def read_robot(path: str | Path) -> tuple[ElementTree.Element, FrameTree]:
+    """Return the root element and the frames of a URDF file; raises as :func:`read_urdf`."""
     data = read_bytes(path)
     with located(path):
-        return _frames(data)
+        root = _root(data)
+        return root, _frames(root)
 
 
-def _frames(data: bytes) -> FrameTree:
-    """Return the frames of the text of a URDF file; raises as :func:`read_urdf`."""
+def _root(data: bytes) -> ElementTree.Element:
+    """Return the root element of the text of a URDF file; raises as :func:`read_urdf`."""
     if b"<xacro:" in data:
         raise InputError(
             "has xacro macros; pass the URDF that xacro makes from it"
@@ -361,6 +368,11 @@ def _frames(data: bytes) -> FrameTree:
         raise InputError(f"not XML: {error}; expected a URDF file") from None
     if root.tag != "robot":
         raise InputError(f"expected a URDF file, found <{root.tag}>")
+    return root
+
+
+def _frames(root: ElementTree.Element) -> FrameTree:
+    """Return the frames of a robot; raises as :func:`read_urdf`."""
     joints = root.findall("joint")
     values = np.array([_origin(joint) for joint in joints]).reshape(-1, 6)
     poses = se3.from_rotation_translation(

@@ -289,7 +289,7 @@ SCREENS = {
     "lost messages": state(
         inputs=stream(
             "child",
-            "12 % of the messages are lost at 50 Hz. "
+            "12 % of the messages are lost. "
             "Free processor time, or publish at a lower rate",
         )
     ),

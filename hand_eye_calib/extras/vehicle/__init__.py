@@ -110,12 +110,25 @@ def _live(*topic: Any) -> Any:
 
 
 def _add_arguments(parser: Any) -> None:
-    """Add the option for a sensor without wheel data to the command line."""
+    """Add the options of vehicles to the command line."""
+    from hand_eye_calib.extras.vehicle.arguments import NominalAction
+
     words = (
         "the only PATH is the trajectory file of a sensor on a vehicle without wheel data: "
         "estimate its x, roll, pitch and yaw on the rear axle"
     )
     parser.add_argument("--on-vehicle", action="store_true", help=words)
+    nominal = (
+        "URDF, or YAML file of a controller of ros2_controllers, with the nominal radius and "
+        "separation of the wheels: sets --nominal-radius and --nominal-separation"
+    )
+    parser.add_argument(
+        "--nominal",
+        metavar="FILE",
+        action=NominalAction,
+        dest="options",
+        help=nominal,
+    )
 
 
 def _is_alone(arguments: Any) -> bool:

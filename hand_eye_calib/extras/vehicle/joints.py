@@ -24,8 +24,9 @@ STEERED = ("steering", "tricycle")
 # used. Below it, the mean of the angles is used: it has less noise, and differs by less than 0.1 %.
 _SMALL_ANGLE = 0.05
 
-_LEFT = "left|_l(_|$)|^l_"
-_RIGHT = "right|_r(_|$)|^r_"
+# Patterns of left and right in the names of joints.
+LEFT = "left|_l(_|$)|^l_"
+RIGHT = "right|_r(_|$)|^r_"
 
 
 class Joints(NamedTuple):
@@ -140,7 +141,7 @@ class WheelJoints:
     def _found(self, names: Sequence[str]) -> Joints | None:
         """Return the joints of the wheels by their names; None if there are no wheels."""
         steered = tuple(name for name in names if "steer" in name.lower())
-        wheels = [name for name in names if _is_wheel(name)]
+        wheels = [name for name in names if is_wheel(name)]
         if not wheels:
             return None
         if self._measures in STEERED:
@@ -151,10 +152,8 @@ class WheelJoints:
                 "steering if the speed is that of the fixed axle, or to tricycle if the steered "
                 "wheel drives"
             )
-        left = tuple(name for name in wheels if re.search(_LEFT, name.lower()))
-        right = tuple(
-            name for name in wheels if re.search(_RIGHT, name.lower())
-        )
+        left = tuple(name for name in wheels if re.search(LEFT, name.lower()))
+        right = tuple(name for name in wheels if re.search(RIGHT, name.lower()))
         if not left or len(left) != len(right):
             raise self._unclear(names)
         return Joints(left, right)
@@ -208,7 +207,7 @@ class WheelJoints:
         return means
 
 
-def _is_wheel(name: str) -> bool:
+def is_wheel(name: str) -> bool:
     """Return whether the name of a joint is that of a driving wheel without steering."""
     lower = name.lower()
     return "wheel" in lower and not ("steer" in lower or "caster" in lower)

@@ -226,10 +226,8 @@ def _name_of(line: Any) -> str:
     return str(line.get_label()).replace(r"\$", "$").removeprefix("\u200b")
 
 
-# Shortest time on an axis of recordings (days). Recordings whose starts are within the second time
-# (days) would be drawn at the same place.
+# Shortest time on an axis of recordings (days): an hour.
 _SHORTEST_AXIS_DAYS = 1.0 / 24.0
-_SAME_TIME_DAYS = 1.0 / 1440.0
 
 
 def recordings_axis(
@@ -251,7 +249,8 @@ def recordings_axis(
     days = date2num(np.array(stamps_ns, dtype="datetime64[ns]"))
     first = float(days.min(initial=np.inf))
     last = float(days.max(initial=-np.inf))
-    if len(days) > 1 and last - first < _SAME_TIME_DAYS:
+    # Starts within a minute would be drawn at the same place.
+    if len(days) > 1 and last - first < _SHORTEST_AXIS_DAYS / 60:
         panels[0].xaxis.set_major_locator(MaxNLocator(4, integer=True))
         panels[-1].set_xlabel(f"number of the {name}")
         return np.arange(1.0, len(days) + 1.0)

@@ -450,9 +450,7 @@ class PoseInput:
         text = f"{share(lost_share)} of the messages are lost"
         advice = "Free processor time, or publish at a lower rate"
         self._log.warning(f"{self.topic}: {text}. {advice}")
-        return InputCondition(
-            Level.WARN, f"{text} at {rate_hz:.0f} Hz. {advice}"
-        )
+        return InputCondition(Level.WARN, f"{text}. {advice}")
 
     def _why_paused(self, steady_s: float, arrived_s: float) -> str:
         """Return the reason why poses no longer arrive; empty if they arrive or it is unknown."""

@@ -63,7 +63,10 @@ _TONES: dict[object, Tone] = {
 }
 
 # States of a broadcast in words, if they differ from the values.
-_BROADCASTS = {Broadcast.ON: "yes, as a static transform"}
+_BROADCASTS = {
+    Broadcast.ON: "yes, as a static transform",
+    Broadcast.WITHDRAWN: "no longer, but they keep it until they restart",
+}
 
 # The board displays the solver's reason in these states, because no newest result explains them.
 _WITHOUT_RESULT = (Standing.NONE, Standing.OUTDATED)
