@@ -5,6 +5,7 @@ import pytest
 from findings import codes_of
 
 from hand_eye_calib.core.checks.check import check_streams
+from hand_eye_calib.core.checks.findings import Severity
 from hand_eye_calib.core.checks.sampling import check_sampling, step_velocities
 from hand_eye_calib.core.checks.streams import check_stream
 from hand_eye_calib.core.geometry.trajectory import Trajectory
@@ -77,3 +78,14 @@ def test_a_copy_with_noise_of_its_own_never_drifts(platform):
         for streams in (sound, copy)
     ]
     assert findings == [set(), {"not_independent"}]
+
+
+@pytest.mark.parametrize("seed", [640502, 640503])
+def test_a_correction_through_a_wrong_mount_is_an_error_on_flat_ground(seed):
+    # Odometry of wheels hides two thirds of the squared differences.
+    streams = faulty("agv", "corrected by the parent, 0.3 s", seed)
+    (finding,) = check_streams(streams.parent, streams.child).findings
+    assert (finding.code, finding.severity) == (
+        "not_independent",
+        Severity.ERROR,
+    )
