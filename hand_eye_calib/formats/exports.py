@@ -26,8 +26,8 @@ from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.core.results.verdict import Judged
 from hand_eye_calib.formats.results import launch_text, xacro_text
 
-# Beginnings of words in the names of frames, by the kind of sensor. The kinds are sorted by their
-# usual place on a vehicle: the base first, then sensors that other sensors are calibrated to.
+# Beginnings of words in frame names, for each kind of sensor. The kinds are in their usual order on
+# a vehicle: first the base, then the sensors to which other sensors are calibrated.
 _ROLES = {
     "base": (
         "base",
@@ -64,7 +64,7 @@ _ROLES = {
     ),
     "gnss": ("gnss", "gps", "antenna", "rtk"),
 }
-# Place of each kind in this order.
+# Position of each kind in this order.
 _RANKS = {role: rank for rank, role in enumerate(_ROLES)}
 # Number of decimals in a file. The last digit of a length in metres is 1 pm.
 _DECIMALS = 12
@@ -85,14 +85,14 @@ class Layout(NamedTuple):
         True if the target is the child, False if the target is the parent, None if both are
         possible.
     keys : sequence of str
-        Keys in the file under which the pose is, or its translation and its rotation.
+        Keys of the pose in the file, or of its translation and its rotation.
     text : str
         Text of the file, with ``%(name)s`` for numbers and names.
     clock : int
-        Sign of the shift of clocks in ``t_target = t_source + clock * shift``; 0 if the file does
-        not contain the shift.
+        Sign in ``t_target = t_source + clock * shift``, the shift of clocks; 0 if the file has no
+        shift.
     axes : sequence of str
-        Axes that the file needs, so the recording must determine them.
+        Axes that the file needs. The recording must determine them.
     axes_note : str
         Note about these axes, which is written into the file.
     """
@@ -116,7 +116,7 @@ class Arrangement(NamedTuple):
     is_inverted : bool
         True if the file contains ``T_child_parent`` instead of ``T_parent_child``.
     is_certain : bool
-        Whether the kinds of the sensors are those of the layout, judged by the names of the frames.
+        Whether the frame names indicate the kinds of sensors in the layout.
     """
 
     layout: Layout
@@ -136,7 +136,7 @@ def formats() -> dict[str, list[Layout]]:
 
 
 def role_of(frame: str) -> str:
-    """Return the kind of a sensor, judged by the name of its frame; empty for other names."""
+    """Return the kind of a sensor according to its frame name; empty for unknown names."""
     words = re.findall(
         "[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", frame).lower()
     )
@@ -145,7 +145,7 @@ def role_of(frame: str) -> str:
         for role, beginnings in _ROLES.items()
         if any(word.startswith(beginnings) for word in words)
     ]
-    # Another kind is preferred to "base": base_imu_link is the frame of an IMU.
+    # Another kind has priority over "base": base_imu_link is the frame of an IMU.
     if len(roles) > 1 and roles[0] == "base":
         return roles[1]
     return roles[0] if roles else ""
@@ -156,8 +156,9 @@ def arranged(
 ) -> Arrangement:
     """Return the layout and the direction that fit the sensors best.
 
-    The criteria are, in this order: most kinds of sensors that match the layout, fewest kinds that
-    contradict it, the first layout, and a parent that comes before the child in ``_ROLES``.
+    The criteria are, in order: the number of sensors whose kind matches the layout, the number
+    whose kind contradicts it, the order of the layouts, and a parent before the child in
+    ``_ROLES``.
     """
     roles = (role_of(parent_frame), role_of(child_frame))
     best_score: tuple[Any, ...] = ()
@@ -168,7 +169,7 @@ def arranged(
             else (layout.is_inverted,)
         )
         for is_inverted in directions:
-            # Kinds of the parent and of the child in this direction; empty for any kind.
+            # Kinds of parent and child in this direction; empty for any kind.
             kinds = (layout.target, layout.source)
             if is_inverted:
                 kinds = (layout.source, layout.target)
@@ -217,7 +218,8 @@ def _filled_layout(result: Judged, name: str) -> str:
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)
     layout = arrangement.layout
-    # The target of such a layout is a vehicle or robot. Prefer the frame in its description.
+    # The target of this layout is a vehicle or robot. Prefer the frame that its description
+    # contains.
     if layout.is_inverted is False and not layout.target:
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]
@@ -235,7 +237,7 @@ def _filled_layout(result: Judged, name: str) -> str:
         T = se3.inverse(T)
         offset_s = -offset_s
     texts = _numbers(T) | _robot_frames(target)
-    # The delay in PX4 is the delay of the child in both directions of the transform.
+    # PX4 expects the delay of the child, in both directions of the transform.
     texts |= {
         "target": json.dumps(target),
         "source": json.dumps(source),
@@ -255,12 +257,12 @@ def _filled_layout(result: Judged, name: str) -> str:
 
 
 def _robot_frames(target: str) -> dict[str, str]:
-    """Return the values of a layout for a robot arm: base, hand, and where the camera is.
+    """Return the values of a layout for a robot arm: base, hand, and place of the camera.
 
     The target is the base or the hand.
     """
     if "base" in target.lower():
-        # The camera does not move with the hand.
+        # The camera is fixed beside the robot.
         return {
             "eye": "eye_on_base",
             "robot": json.dumps(target),
@@ -289,7 +291,7 @@ def _remarks(
     target: str,
     source: str,
 ) -> list[str]:
-    """Return remarks for the user of a file: direction, clocks, assumptions and axes."""
+    """Return remarks for the user of a file, about direction, clocks, assumptions and axes."""
     layout = arrangement.layout
     sign = "-" if result.time_offset_s < 0 else "+"
     origin = (
@@ -350,8 +352,7 @@ def _listed(values: FloatArray, separator: str = ", ") -> str:
 
 def _number(value: float) -> str:
     """Return a number as text that every parser reads: a decimal point and no exponent."""
-    # Adding 0.0 turns -0.0 into 0.0.
-    # The sum turns -0.0 into 0.0.
+    # Rounding may produce -0.0. Adding 0.0 changes it to 0.0.
     rounded = round(float(value), _DECIMALS) + 0.0
     text = f"{rounded:.{_DECIMALS}f}".rstrip("0")
     return f"{text}0" if text.endswith(".") else text

@@ -1,8 +1,8 @@
 """Open, read and write files of unknown origin, with limits of their size.
 
 Text and YAML that are too large are refused before memory is allocated. Bags are read by libraries,
-which may trust a wrong size in a damaged bag. During this time, a command limits the growth of the
-memory of its process to :data:`LARGEST`. This limit does not include the poses that are kept.
+which may trust a wrong size in a damaged bag. While a bag is read, a command limits the growth of
+its memory to :data:`LARGEST`. This limit does not include the poses that are kept.
 """
 
 import os
@@ -59,8 +59,8 @@ _STATM = Path("/proc/self/statm")
 # Whether `reading_memory` limits the memory.
 _is_limited = False
 
-# For each reading in progress, the limits of the process before it. Several threads may read; the
-# last reading to end restores the limits that were valid before the first reading.
+# Limits of the process before each reading in progress. Several threads may read: the last one to
+# end restores the limits from before the first reading.
 _before: list[tuple[int, int]] = []
 _lock = threading.Lock()
 
@@ -68,7 +68,7 @@ _lock = threading.Lock()
 def limit_memory() -> None:
     """Limit the memory of all later readings, if the system allows this (Linux).
 
-    Only commands call this function, because the limit is for the whole process.
+    Only commands call this function, because the limit applies to the whole process.
     """
     global _is_limited
     _is_limited = _STATM.exists()
@@ -76,10 +76,9 @@ def limit_memory() -> None:
 
 @contextmanager
 def reading_memory() -> Iterator[None]:
-    """Context in which the memory of the process grows by at most :data:`LARGEST`.
+    """Limit the growth of memory within this context to :data:`LARGEST`.
 
-    Larger growth raises a MemoryError. Without an earlier call of :func:`limit_memory`, there is no
-    limit.
+    Larger growth raises a MemoryError. There is no limit if :func:`limit_memory` was not called.
     """
     if not _is_limited:
         yield
@@ -89,7 +88,7 @@ def reading_memory() -> Iterator[None]:
     with _lock:
         limits = resource.getrlimit(resource.RLIMIT_AS)
         _before.append(limits)
-        # The limit of the system is for virtual memory: the first number of statm, in pages.
+        # The system limits the virtual memory, which is the first number of statm, in pages.
         largest = (
             int(_STATM.read_text().split()[0]) * resource.getpagesize()
             + LARGEST
@@ -128,19 +127,19 @@ def local_path(source: str | Path) -> Path:
 
 
 def path_of(name: str, value: Any) -> Path:
-    """Return an argument of the Python interface as a path, see :func:`local_path`.
+    """Return an argument of the Python interface as a path; see :func:`local_path`.
 
     Raises
     ------
     InputError
-        If the value is neither text nor path-like. ``name`` is the argument in the message.
+        If the value is neither text nor path-like. The message names the argument ``name``.
     """
     require_type(name, value, str, PathLike)
     return local_path(os.fspath(value))
 
 
 def similar(path: str | Path) -> str:
-    """Return ``; did you mean NAME?`` for a missing file; empty without a similar name there."""
+    """Return ``; did you mean NAME?`` for a missing file; empty if no similar name exists there."""
     # The folder may not exist, or the path may contain a zero byte.
     with suppress(OSError, ValueError):
         if not Path(path).exists():
@@ -210,7 +209,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
     Raises
     ------
     InputError
-        If the data is not text. ``expected`` describes the expected file in the message.
+        If the data are not text. The message describes the expected file by ``expected``.
     """
     try:
         return data.decode("utf-8-sig")
@@ -222,7 +221,7 @@ def decoded(path: str | Path, data: bytes, expected: str) -> str:
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[None]:
-    """Context that turns an OSError into an InputError with the name of the file, or ``path``."""
+    """Convert an OSError in this context to an InputError that names the file, or ``path``."""
     try:
         yield
     except OSError as error:
@@ -235,14 +234,14 @@ def writing(path: str | Path) -> Iterator[None]:
 def write_atomically(contents: Mapping[Path, str | bytes]) -> None:
     """Write files under temporary names, and then rename them.
 
-    So other programs always read a complete file, the old or the new one. Text is written in UTF-8.
-    A symbolic link is replaced by the file; the target of the link does not change.
+    Other programs therefore always read a complete file, old or new. Text is written in UTF-8. A
+    symbolic link is replaced by the file; its target does not change.
 
     Raises
     ------
     OSError
-        If a file cannot be written or renamed; the error names the file. No old file changes if a
-        file cannot be written. If one cannot be renamed, the files before it are already replaced.
+        If a file cannot be written or renamed; the error names the file. If writing fails, no old
+        file has changed. If renaming fails, the earlier files in the list are already replaced.
     """
     temporaries = {
         path: path.with_name(f".{path.name[:100]}.{os.urandom(8).hex()}")

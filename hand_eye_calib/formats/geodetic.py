@@ -50,8 +50,8 @@ class LocalOrigin:
         from_origin = positions - _earth_centred(
             origin_lat, origin_lon, origin_height
         )
-        # Product of vectors (N, 3) and axes (1, 3, 3). Sums have the same bits for one position (in
-        # live use) and for many positions. A matrix product does not.
+        # Multiply vectors (N, 3) by axes (1, 3, 3) as a sum. The sum has equal bits for one
+        # position (live) and for many positions, unlike a matrix product.
         terms = from_origin[:, :, None] * _axes(origin_lat, origin_lon)
         return terms[:, 0] + terms[:, 1] + terms[:, 2]
 
@@ -59,8 +59,8 @@ class LocalOrigin:
 def axes_of_places(positions: FloatArray) -> FloatArray:
     """Return the axes east, north and up (N, 3, 3), as columns, at positions (N, 3), m.
 
-    Positions and axes are in ECEF. Latitudes are computed by the method of Bowring 1976. Its errors
-    on the ground are at most 1e-9 rad.
+    Positions and axes are in ECEF. Latitudes are computed by the method of Bowring 1976, with
+    errors of at most 1e-9 rad on the ground.
     """
     x, y, z = positions.T
     # Distance from the axis of the earth.
@@ -75,7 +75,7 @@ def axes_of_places(positions: FloatArray) -> FloatArray:
 
 
 def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
-    """Return the rotations (N, 3, 3) from the axes at each position to the axes at the first one.
+    """Return the rotations (N, 3, 3) from the axes at each position to those at the first.
 
     The axes are east, north and up.
     """
@@ -86,7 +86,7 @@ def rotations_to_first(lat_rad: FloatArray, lon_rad: FloatArray) -> FloatArray:
 def _earth_centred(
     lat_rad: FloatArray, lon_rad: FloatArray, height_m: FloatArray
 ) -> FloatArray:
-    """Return positions (N, 3), m, in ECEF: the formulas of this module."""
+    """Return positions (N, 3), m, in ECEF, by the formulas of this module."""
     sin_lat = np.sin(lat_rad)
     cos_lat = np.cos(lat_rad)
     # Radius of curvature nu in the prime vertical.

@@ -1,6 +1,6 @@
-"""Read the installed extrinsic, which the robot uses now.
+"""Read the installed extrinsic, which the robot uses at present.
 
-Its source is a robot description, an earlier result, a file of another program, a bag, or numbers.
+Sources are a robot description, an earlier result, a file of another program, a bag, or numbers.
 """
 
 import os
@@ -47,7 +47,7 @@ _EXPECTED = (
 
 
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
-    """Read the source of an installed extrinsic, before the frames of the sensors are known.
+    """Read the source of an installed extrinsic before the frames of the sensors are known.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     Returns
     -------
     callable
-        ``find(parent_frame, child_frame)`` returns the pose of the child sensor in the parent
-        sensor's frame. It raises an InputError if the source has no such pose.
+        Function ``find(parent_frame, child_frame)`` that returns the pose of the child sensor in
+        the parent sensor's frame. It raises an InputError if the source has no such pose.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def stated(
     Parameters
     ----------
     find : callable
-        ``find(parent_frame, child_frame)`` returns the pose (4, 4).
+        Function ``find(parent_frame, child_frame)`` that returns the pose (4, 4).
     origin : str
         Name of the source, for the result and for messages.
     parent_frame, child_frame : str
@@ -163,12 +163,12 @@ def frames_of_bag(path: str | Path) -> FrameTree:
 def _of_result(
     result: Calibration, path: Path, parent_frame: str, child_frame: str
 ) -> Extrinsic:
-    """Return the pose in an earlier result of this package, inverted if the sensors are exchanged.
+    """Return the pose in an earlier result of this package, inverted for exchanged sensors.
 
     Raises
     ------
     InputError
-        If the result is that of other sensors.
+        If the result is for other sensors.
     """
     result_parent = frame_name(result.parent_frame)
     result_child = frame_name(result.child_frame)
@@ -192,10 +192,10 @@ def _of_result(
 
 
 def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
-    """Return the pose (4, 4) of the child sensor in the parent sensor's frame, from any document.
+    """Return the pose (4, 4) of the child in the parent's frame, from a document of any layout.
 
-    Transforms with the names of both frames are preferred. Otherwise the pose is searched by the
-    keys of the export formats. At last, a document with one matrix is that matrix.
+    First choice are transforms with the names of both frames, second choice are the keys of the
+    export formats. If a document has a single matrix, this is the last choice.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
             )
             is_fixed = layout.is_inverted is not None
             if is_fixed and child_frame not in names and parent_frame in names:
-                # The file names the frame of its child, and here this sensor is the parent.
+                # The file names its child's frame, and this sensor is the parent here.
                 is_inverted = not is_inverted
             T = pose_of(*values)
             return se3.inverse(T) if is_inverted else T
@@ -234,13 +234,13 @@ def _find(document: Any, parent_frame: str, child_frame: str) -> FloatArray:
 
 
 def _fits(layout: Layout, nodes: "Sequence[_Node]") -> bool:
-    """Whether a mapping of the document has all keys of the layout."""
+    """Return whether a mapping of the document has all keys of the layout."""
     return bool(layout.keys) and any(
         _values_at(node, layout.keys) for _, node in nodes
     )
 
 
-# The keys that lead to a mapping in a document, and this mapping.
+# Keys that lead to a mapping in a document, and this mapping.
 _Node = tuple[tuple[str, ...], Mapping[str, Any]]
 
 
@@ -261,10 +261,10 @@ def _nodes(document: Any, path: tuple[str, ...]) -> Iterator[_Node]:
 def _named_transform(
     path: tuple[str, ...], node: Mapping[str, Any]
 ) -> tuple[Any, ...]:
-    """Return the parent frame, the child frame and the pose of a mapping that is a named transform.
+    """Return parent frame, child frame and pose of a mapping that is a transform with names.
 
-    The pose is one value (any form of :func:`.frames.pose_of`), or two values: translation (m) and
-    roll, pitch, yaw (deg). The tuple is empty for other mappings.
+    The pose is one value, in any form of :func:`.frames.pose_of`, or two values: translation (m)
+    and roll, pitch, yaw (deg). The result is empty for other mappings.
     """
     header = node.get("header")
     parameters = node.get("parameters")
@@ -275,14 +275,14 @@ def _named_transform(
             node["child_frame_id"],
             node.get("transform"),
         )
-    # One transform of a list.
+    # One of several transforms in a list.
     if {"parent", "child", "value"} <= node.keys():
         return node["parent"], node["child"], node["value"]
     # A mapping {parent: {child: {x: ..., yaw: ...}}}.
     if {*AXES} <= node.keys() and len(path) > 1:
         rpy_deg = np.degrees(numbers_of([node[name] for name in ROTATIONS]))
         return *path[-2:], [node[name] for name in TRANSLATIONS], rpy_deg
-    # easy_handeye2: the robot's frame is its base or its hand.
+    # easy_handeye2: the frame of the robot is its base or its hand.
     if isinstance(parameters, Mapping) and "transform" in node:
         is_fixed = parameters.get("calibration_type") == "eye_on_base"
         robot = parameters.get(
@@ -295,15 +295,16 @@ def _named_transform(
 def _of_sensors(
     nodes: list[_Node], keys: Sequence[str], frames: set[str]
 ) -> tuple[set[str], list[Any]]:
-    """Return the values under ``keys`` in the mapping of two sensors, and the frames it names.
+    """Return the values under ``keys`` in the mapping about two sensors, and the frames in it.
 
-    ``frames`` are the frames of the sensors. A mapping names a frame by one of its values, or by a
-    key that leads to it. If several mappings have the keys, those that name no frame are ignored.
+    ``frames`` are the frames of both sensors. A mapping names a frame in one of its values, or in a
+    key that leads to the mapping. If several mappings have the keys, mappings without the name of a
+    frame are ignored.
 
     Raises
     ------
     InputError
-        If not exactly one mapping remains.
+        If there is no mapping, or more than one remains.
     """
     extrinsics = []
     for path, node in nodes:

@@ -1,14 +1,14 @@
-"""Session journal: the poses that the node receives, written to disk as they arrive.
+"""Session journal: poses that are written to disk when the node receives them.
 
 After a crash, only the last poses are lost.
 
 A journal is a directory with a text file for each stream: ``parent.tum``, ``child.tum`` and so on.
-Other programs can read these files, too. Each pose is a line ``t x y z qx qy qz qw``, with the
+Other programs can also read these files. Each pose is a line ``t x y z qx qy qz qw``, with the
 stamp in seconds and all digits of every number. A line that begins with ``# {`` is JSON. The first
-such line describes the stream and its options; later lines contain changes. ``parent_poses`` in
-such a line is the number of poses in the parent's file when the next poses of this file were
-written. The order in which poses of several streams arrived is computed from this number. A process
-that is killed may leave an incomplete line, so the reader stops before the first unreadable line.
+such line describes the stream and its options; later lines contain changes. The value
+``parent_poses`` in such a line is the length of the parent's file when the next poses of this file
+were written. The order of arrival over several streams is computed from it. A killed process may
+leave an incomplete line, so the reader stops before the first unreadable line.
 """
 
 import json
@@ -36,21 +36,21 @@ _FORMAT = "hand_eye_calib/journal"
 # Version of the format; journals of other versions are rejected.
 _VERSION = 2
 _STREAMS = ("parent", "child", *other_names())
-# Key of the number of the parent's poses.
+# Key of the number of poses in the parent's file.
 _BATCH = "parent_poses"
-# End (exclusive) of the numbers in the names of journals that were renamed, see `keep_aside`.
+# Numbers in the names of renamed journals are below this, see `keep_aside`.
 _END_OF_NUMBERS = 100
-# Remedy in messages about a journal that cannot be read.
+# Advice in messages about a journal that cannot be read.
 _ADVICE = "move it away to start anew"
-# Types of errors that parsing raises for a line that is not of a journal.
+# Types of errors in the parsing of a line that does not belong to a journal.
 _UNREADABLE = (ValueError, TypeError, OverflowError, RecursionError)
 
-#: Description of each stream in plain values: topic, frame, origin, options and others.
+#: Description of each stream as plain values: topic, frame, origin, options and others.
 About = Mapping[str, Document]
 
 
 class JournalWriter:
-    """Writer of the journal of one session into a directory.
+    """Write the journal of a session into a directory.
 
     All methods raise an OSError if the directory cannot be written.
 
@@ -61,12 +61,12 @@ class JournalWriter:
     about : About
         Description of each stream.
     resumed : Journal, optional
-        Session in the directory that is continued. The unreadable end of its files is cut off.
+        Session in the directory to be continued. The unreadable end of its files is removed.
 
     Raises
     ------
     OSError
-        Also if a file with a stream's name is a link, or is not a journal.
+        Also raised if the file of a stream is a link, or is not a journal.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class JournalWriter:
         }
         self._files: dict[str, FileIO] = {}
         for stream in self._pending:
-            # Without a buffer, data that was written survives a crash of this process.
+            # Without a buffer, written data survives a crash of this process.
             path = Path(directory, f"{stream}.tum")
             self._files[stream] = open(  # noqa: SIM115
                 path, "ab", buffering=0, opener=_open_no_link
@@ -131,7 +131,7 @@ class JournalWriter:
 
     def flush(self) -> None:
         """Pass all pending poses to the operating system, so that they survive a crash."""
-        # The parent is the first stream, so its number of poses is up to date for the others.
+        # The parent is the first stream, so the other streams use its final number of poses.
         for stream, lines in self._pending.items():
             if not lines:
                 continue
@@ -147,7 +147,7 @@ class JournalWriter:
     def _write(self, stream: str, lines: Sequence[str]) -> None:
         """Write lines to the file of a stream; raise an OSError if the file was replaced."""
         file = self._files[stream]
-        # Data written to a file that was replaced or deleted would be lost.
+        # Data for a replaced or deleted file would be lost.
         if not os.path.samestat(os.stat(file.name), os.fstat(file.fileno())):
             raise OSError("another program has replaced its file")
         file.write("\n".join([*lines, ""]).encode())
@@ -163,7 +163,7 @@ class JournalWriter:
 
 @dataclass(frozen=True)
 class Journal:
-    """Session that was read from a directory; its poses are in the order of their arrival.
+    """Session that was read from a directory. The poses are in the order of arrival.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ def read_journal(directory: str | Path) -> Journal:
         for stream, path in paths.items()
         if os.path.lexists(path)
     }
-    # Check this after reading, because a node may have renamed the directory in the meantime.
+    # Check this after reading: a node may have renamed the directory in the meantime.
     if "parent" not in files:
         raise InputError(f"no session journal in {directory}")
     rows = np.concatenate(
@@ -222,9 +222,9 @@ def read_journal(directory: str | Path) -> Journal:
 class _StreamFile(NamedTuple):
     """Content of the file of one stream.
 
-    ``values`` are rows of 8 numbers: the order of arrival and x y z qx qy qz qw. The order of
-    arrival of a parent's pose is its index; that of another pose is between two such indices.
-    ``whole_bytes`` is the number of bytes of the complete lines.
+    ``values`` are rows of 8 numbers: order of arrival, x y z, qx qy qz qw. The order of arrival of
+    a parent's pose is its index. Other poses have values between two such indices. ``whole_bytes``
+    is the length of the complete lines.
     """
 
     about: Document
@@ -236,7 +236,7 @@ class _StreamFile(NamedTuple):
 def _read(path: Path) -> _StreamFile:
     """Read the file of one stream up to the first unreadable line."""
     about: Document = {}
-    # A session may last all day. A pose takes 72 bytes in these arrays, but 500 bytes in lists.
+    # A session may last all day. A pose takes 72 bytes in these arrays; in lists it would take 500.
     stamps_ns = array("q")
     values = array("d")
     whole_bytes = 0
@@ -249,8 +249,8 @@ def _read(path: Path) -> _StreamFile:
                 seconds, _, decimals = stamp.partition(b".")
                 if len(cells) != 7 or len(decimals) != 9:
                     break
-                # Order of arrival: 0, 1, 2, ... for the parent's poses. A pose of another stream
-                # that arrived after n poses of the parent has n - 0.5.
+                # Order of arrival: 0, 1, 2, ... for the parent's poses, and n - 0.5 for a pose of
+                # another stream that arrived after n poses of the parent.
                 arrival = about.get(_BATCH, len(stamps_ns) + 0.5) - 0.5
                 row = [float(cell) for cell in (arrival, *cells)]
                 stamps_ns.append(int(seconds + decimals))
@@ -269,7 +269,7 @@ def _read(path: Path) -> _StreamFile:
 
 
 def _refuse_foreign(directory: Path) -> None:
-    """Raise an OSError if a file with a stream's name is not a journal, to protect it."""
+    """Raise an OSError if the file of a stream is not a journal, so that it is not overwritten."""
     for stream in _STREAMS:
         path = directory / f"{stream}.tum"
         if os.path.lexists(path) and not _is_own(path):
@@ -277,7 +277,7 @@ def _refuse_foreign(directory: Path) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Whether a file belongs to a journal: no link, and either empty or with its first line."""
+    """Return whether a file belongs to a journal: no link, and empty or with its first line."""
     if path.is_symlink() or not path.is_file():
         return False
     with open_regular(path) as file:
@@ -288,27 +288,27 @@ def _is_own(path: Path) -> bool:
 
 
 def _open_no_link(path: str, flags: int) -> int:
-    """Open a file for the builtin open; raise an OSError if the path is a link."""
+    """Open a file like the builtin open. Raise an OSError if the path is a link."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def is_used(directory: str | Path) -> bool:
-    """Whether a directory has a file with a stream's name, a journal or not."""
+    """Return whether a directory has a file with the name of a stream, even if it is no journal."""
     return any(
         os.path.lexists(Path(directory, f"{stream}.tum")) for stream in _STREAMS
     )
 
 
 def has_session(directory: str | Path) -> bool:
-    """Whether a directory has the parent's file of a journal."""
+    """Return whether a directory has the parent's file of a journal."""
     return os.path.isfile(Path(directory) / "parent.tum")
 
 
 def keep_aside(directory: str | Path) -> Path:
-    """Rename the directory of a journal, so that a new session can use its name.
+    """Rename the directory of a journal, so that its name is free for a new session.
 
     The new name of ``journal`` is ``journal.previous``. An older journal with this name is removed.
-    If the name belongs to other files, the next free name is used, such as ``journal.previous2``.
+    If other files have this name, the next free name is used, such as ``journal.previous2``.
 
     Returns
     -------
@@ -333,7 +333,7 @@ def keep_aside(directory: str | Path) -> Path:
 
 
 def _is_journal(directory: Path) -> bool:
-    """Whether a directory is not a link and contains only files of a journal."""
+    """Return whether a directory is not a link and contains only files of a journal."""
     if directory.is_symlink() or not directory.is_dir():
         return False
     names = {f"{stream}.tum" for stream in _STREAMS}
@@ -358,7 +358,7 @@ def replay_journal(
     Raises
     ------
     InputError
-        If a calibrator rejects a pose. ``directory`` is the name of the session in the message.
+        If a calibrator rejects a pose. The message names the session by ``directory``.
     """
     with located(f"cannot use the session journal {directory}"):
         for stream, about in journal.about.items():

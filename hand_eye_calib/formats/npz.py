@@ -38,8 +38,8 @@ def read_arrays(
     Raises
     ------
     InputError
-        If the file cannot be read, or if the arrays take more than ``largest`` bytes. This limit
-        is for the unpacked arrays, because zeros are compressed to a thousandth of their size.
+        If the file cannot be read, or if its arrays take more than ``largest`` bytes. The limit
+        applies to unpacked arrays: compressed zeros take a thousandth of their size.
     """
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:

@@ -1,7 +1,7 @@
 """Copy bags from object storage and web servers.
 
-The package fsspec copies a bag to a temporary folder. The copy is read and then removed. Examples
-of URLs are ``s3://bucket/run_1``, ``gs://...`` and ``https://host/run_1.mcap``.
+fsspec copies a bag to a temporary folder, which is removed after the bag was read. Examples of URLs
+are ``s3://bucket/run_1``, ``gs://...`` and ``https://host/run_1.mcap``.
 """
 
 import json
@@ -19,18 +19,18 @@ from hand_eye_calib.core.base.errors import (
     installing,
 )
 
-#: Function that replaces the paths of copies by the URLs of the bags, in plain values.
+#: Function that replaces the paths of copies by the URLs of the bags in plain values.
 RestoreUrls = Callable[[Any], Any]
 
 # Endings of the files of a bag that are copied.
 _SUFFIXES = (".yaml", ".mcap", ".db3", ".bag", ".zstd")
-# Endings of files that SQLite keeps next to a .db3 while writing. If the recorder was killed, these
-# files contain its newest messages.
+# Endings of files that SQLite keeps beside a .db3 while writing. If the recorder was killed, they
+# contain the newest messages.
 _JOURNALS = (".db3-wal", ".db3-journal")
 
 
 def is_url(path: object) -> bool:
-    """Whether the name of a bag is a URL, not a path."""
+    """Return whether the name of a bag is a URL instead of a path."""
     return "://" in str(path)
 
 
@@ -59,7 +59,7 @@ def expanded(pattern: str) -> list[str]:
 def local_copies(
     paths: Sequence[Any],
 ) -> Iterator[tuple[list[Any], RestoreUrls]]:
-    """Copy remote bags to this machine; the copies are removed at the end of the context.
+    """Copy remote bags to this machine. The copies are removed at the end of the context.
 
     Errors that are raised in the context name the URLs instead of the copies.
 
@@ -68,13 +68,13 @@ def local_copies(
     paths : list of path-like
         Paths of all bags on this machine.
     restore_urls : callable
-        Replaces the paths of the copies by the URLs in plain values.
+        Function that replaces the paths of the copies by the URLs in plain values.
 
     Raises
     ------
     InputError
-        If a store cannot be reached or has no bag, or if the bag is larger than half of the free
-        disk space.
+        If a store cannot be reached or has no bag, or if the bag would fill more than half of the
+        free disk space.
     MissingDependencyError
         If a package that the store needs is not installed.
     """
@@ -125,7 +125,7 @@ def _copied(url: str, folder: Path) -> Path:
             raise InputError(
                 f"no bag there: expected files that end in {', '.join(_SUFFIXES)}"
             )
-        # Use at most half of the free space, because other processes may copy bags, too.
+        # Use at most half of the free space: other processes may copy bags at the same time.
         largest = shutil.disk_usage(folder).free // 2
         if sum(entry.get("size") or 0 for entry in files) > largest:
             raise InputError(
@@ -133,7 +133,7 @@ def _copied(url: str, folder: Path) -> Path:
                 f"{tempfile.gettempdir()}; set TMPDIR to a folder with more space"
             )
         for entry in files:
-            # Use only the last part of the name. A store could otherwise choose another folder.
+            # Use only the last part of the name. Otherwise a store could choose another folder.
             system.get_file(entry["name"], str(folder / _name(entry["name"])))
         return folder / _name(path) if is_file else folder
 
@@ -156,9 +156,9 @@ def _name(path: str) -> str:
 def _reached(url: str) -> Iterator[tuple[Any, str]]:
     """Yield the file system of a URL, and the path in this file system.
 
-    Any error that is raised in the context becomes an InputError of one line, because each kind of
-    store raises errors of other types. Little other code than that of fsspec runs in the context,
-    so its defects are not hidden.
+    Any error in the context becomes an InputError of one line, because stores raise errors of many
+    types. Hardly any code except fsspec runs in the context, so defects of this package are not
+    hidden.
     """
     try:
         from fsspec.core import url_to_fs

@@ -53,7 +53,7 @@ XACRO_NAME = "extrinsic.urdf.xacro"
 LAUNCH_NAME = "static_transform.launch.py"
 _NAMES = (XACRO_NAME, LAUNCH_NAME, FILE_NAME)
 # A file was written by this program if it contains one of these texts: the name of the program, or
-# the column of headlines in a table of many calibrations.
+# the column of headlines in a table of calibrations.
 _MARKS = (b"hand_eye_calib", b'"headline"')
 
 
@@ -64,9 +64,9 @@ def save_result(
 ) -> Path:
     """Write ``extrinsic.yaml``, ``extrinsic.urdf.xacro`` and ``static_transform.launch.py``.
 
-    Parts of the result may have further files. If the verdict is DO NOT USE, only
-    ``extrinsic.yaml`` is written, and the other files of an earlier result are removed. If a file
-    cannot be written, no file changes.
+    Parts of the result may add files. If the verdict is DO NOT USE, only ``extrinsic.yaml`` is
+    written, and the other files of an earlier result are removed. If a file cannot be written, no
+    file changes.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ def save_result(
     directory : str or path-like
         A missing directory is made.
     inputs : mapping, optional
-        Origin of the data in plain values, for the provenance in ``extrinsic.yaml``. Its entry
-        ``options`` becomes the entry ``parameters`` of the provenance.
+        Origin of the data as plain values, for the provenance in ``extrinsic.yaml``. Its entry
+        ``options`` is stored as the entry ``parameters``.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def save_result(
 
 
 def _names_of_parts() -> list[str]:
-    """Return the names of the files that the parts of results have."""
+    """Return the names of the files that parts of results add."""
     return [name for extra in all_parts() for name in extra.file_names]
 
 
@@ -113,8 +113,8 @@ def save(
 ) -> Path:
     """Save a result and its report; earlier files are kept in the folder ``previous``.
 
-    Files, parameters and errors are those of :func:`save_result`. The report of the earlier result
-    is kept in ``previous``, too, because it does not belong to the new result.
+    For files, parameters and errors see :func:`save_result`. The report of the earlier result is
+    also moved to ``previous``, because it does not belong to the new result.
 
     Examples
     --------
@@ -125,14 +125,14 @@ def save(
     directory = path_of("directory", directory)
     # A report that was written before the first save belongs to this result.
     has_earlier = Path(directory, FILE_NAME).exists()
-    # The folder of a rig has a launch file of its own, which this result replaces.
+    # The folder of a rig has its own launch file, which this result replaces.
     if any(Path(directory, name).exists() for name in (*_NAMES, RIG_NAME)):
         keep_earlier_results(directory)
     path = save_result(calibration, directory, inputs)
     if has_earlier:
         with writing(directory):
             Path(directory, REPORT_NAME).unlink(missing_ok=True)
-    # A result that was read from a file has no poses to draw.
+    # A result from a file has no poses to draw.
     if calibration.motion_residuals and "report" in RESULT_METHODS:
         RESULT_METHODS["report"](calibration, Path(directory, REPORT_NAME))
     return path
@@ -152,7 +152,7 @@ def save_rig(
     """
     folders = {RIG_NAME, LAUNCH_NAME, REPORT_NAME}
     for calibration in calibrations:
-        # Replace characters of the frame's name that the name of a folder should not contain.
+        # Replace characters that are not suitable for the name of a folder.
         name = (
             re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(
                 "."
@@ -188,7 +188,7 @@ def save_text(path: Path, text: str) -> Path:
 def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
     """Write texts into files of a directory, and return the path of the last file.
 
-    ``texts`` are the contents by file name; a file with None is removed. If a file cannot be
+    ``texts`` has the contents by file name. A file with None is removed. If a file cannot be
     written, no file changes.
     """
     contents = {
@@ -211,7 +211,7 @@ def _written(directory: Path, texts: Mapping[str, str | None]) -> Path:
 def _yaml_text(
     document: Mapping[str, Any], inputs: Mapping[str, Any] | None
 ) -> str:
-    """Return a document as YAML, with the versions, options and inputs that it was made from."""
+    """Return a document as YAML, with the versions, options and inputs of the result."""
     inputs = {**(inputs or {})}
     provenance = {
         "package": "hand_eye_calib",
@@ -226,10 +226,10 @@ def _yaml_text(
 
 
 def _keep_foreign(path: Path) -> None:
-    """Preserve a file that is about to be replaced, unless this program has written it.
+    """Keep a copy of a file that will be replaced, unless this program has written it.
 
-    The file gets a second name: its own with ``.kept``, ``.kept2`` and so on. Links need no second
-    name, because their targets do not change, nor do files with a copy in ``previous``.
+    The copy has the name of the file with ``.kept``, ``.kept2`` and so on. Links need no copy,
+    because their targets do not change. Files with a copy in ``previous`` need no second copy.
     """
     if path.is_symlink() or not path.is_file():
         return
@@ -256,7 +256,7 @@ def keep_earlier_results(directory: str | Path) -> str:
     Returns
     -------
     str
-        A note for the user; empty without such files.
+        Note for the user; empty if there were no such files.
 
     Raises
     ------
@@ -313,7 +313,7 @@ def load_result(path: str | Path) -> Calibration:
     Raises
     ------
     InputError
-        If the file cannot be read, is not a calibration or has an unknown version.
+        If the file cannot be read, is not a calibration, or has an unknown version.
 
     Examples
     --------
@@ -369,7 +369,7 @@ def xacro_text(calibration: Judged) -> str:
     child = calibration.child_frame
     numbers = usable_numbers(calibration) | usable_angles(calibration)
     comment = "\n".join(f"     {line}" for line in _remarks(calibration))
-    # XML forbids two hyphens in a comment: separate them by a space.
+    # XML forbids two hyphens in a comment. Separate them by a space.
     return _template(XACRO_NAME).format(
         comment=re.sub("-(?=-)", "- ", comment),
         joint=_quoted(f"{parent}_to_{child}"),

@@ -1,6 +1,6 @@
-"""Recognise a saved result that a user gives in place of a recording.
+"""Recognise a saved result that a user passes instead of a recording.
 
-This module is light: it loads numpy only for a folder.
+This module loads numpy only if the path is a folder.
 """
 
 import re
@@ -10,16 +10,16 @@ from pathlib import Path
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.formats.files import open_regular
 
-# Line that only the file of a result has.
+# Line that occurs only in the file of a result.
 _LINE_OF_RESULT = re.compile(
     rb"^format: hand_eye_calib/extrinsic\s*$", re.MULTILINE
 )
-# Number of bytes at the beginning of the file that contain this line.
+# This line is in the first bytes of the file (number of bytes).
 _BEGINNING = 4096
 
 
 def refuse_saved_result(path: Path) -> None:
-    """Raise an InputError if a path is a saved result; the error names what to do instead."""
+    """Raise an InputError if a path is a saved result. The error contains what to do instead."""
     if is_saved_result(path):
         raise InputError(
             f"{path} is a saved result, not a recording: display it with hand_eye_calib info "
@@ -38,7 +38,7 @@ def is_saved_result(path: Path) -> bool:
 
         if not (path / FILE_NAME).is_file():
             return False
-        # A session writes its result beside its journal and its recording.
+        # A session writes its result into the folder of its journal and its recording.
         has_journal = any(map(has_session, [path, *path.iterdir()]))
         return not (has_journal or any(map(has_suffix_of_bag, path.rglob("*"))))
     if path.suffix not in (".yaml", ".yml") or not path.is_file():

@@ -22,10 +22,10 @@ from hand_eye_calib.core.geometry.frames import FrameTree, check_pose
 # A new recording begins if the stamps of an edge jump back by more than this (ns).
 _JUMP_BACK_NS = STAMP_UNITS["s"]
 
-# Number of transforms of an edge from which its rate is estimated.
+# Number of transforms after which the rate of an edge is estimated.
 _RATE_FROM = 5
-# Largest number of transforms that are stored for each moving edge, until the other edges reach
-# their stamps.
+# Largest number of stored transforms per moving edge, while other edges have not reached their
+# stamps.
 _MOST_KEPT = 2000
 
 # Pose x y z qx qy qz qw of a frame in its parent.
@@ -45,15 +45,15 @@ class TfSource(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> "TfSource":
-        """Parse ``world:sensor``; raise a ConfigError if these are not two different frames."""
+        """Parse ``world:sensor``. Raise a ConfigError unless it names two different frames."""
         return cls(*split_frames("a transform", text))
 
 
 class PoseFields(NamedTuple):
     """Stamped pose or transform from a message; the position is in m.
 
-    ``world_frame`` and ``sensor_frame`` of a transform are its parent frame and its child frame.
-    ``sensor_frame`` is None if the type of the message has no such field.
+    ``world_frame`` and ``sensor_frame`` of a transform are its parent and child frame.
+    ``sensor_frame`` is None if the message type has no such field.
     """
 
     stamp_ns: int
@@ -66,17 +66,17 @@ class PoseFields(NamedTuple):
 class TfStream:
     """Stream of a sensor's poses, composed from the edges of a transform tree as they arrive.
 
-    Each transform of the moving edge with the lowest rate becomes one pose. The other moving edges
-    are interpolated at its stamp. They are not extrapolated, and not interpolated between
-    transforms that are more than ``max_gap_s`` apart. Transforms with a stamp that is not later
-    than the last stamp of their edge are skipped.
+    Each transform of the slowest moving edge becomes a pose. The other moving edges are
+    interpolated at its stamp: without extrapolation, and only between transforms that are at most
+    ``max_gap_s`` apart. A transform is skipped if its stamp is not later than the last stamp of its
+    edge.
 
     Parameters
     ----------
     source : TfSource
     max_gap_s : float
-        Largest time between two transforms (s) for interpolation. The attribute of this name may
-        be changed later.
+        Largest time (s) between two transforms that are interpolated. The attribute with this name
+        may be changed later.
     tree : FrameTree, optional
         Edges that are known before the first transform arrives.
     """
@@ -94,7 +94,7 @@ class TfStream:
     def add(
         self, transform: PoseFields, is_static: bool
     ) -> Iterator[PoseFields]:
-        """Add a transform, and yield the sensor's poses for which all edges are now known.
+        """Add a transform. Yield the poses of the sensor for which all edges are now known.
 
         Raises the errors of :meth:`edges_at`.
         """
@@ -108,7 +108,7 @@ class TfStream:
     def edges_at(
         self, transform: PoseFields, is_static: bool
     ) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Add a transform, and yield the stamps at which all edges are now known.
+        """Add a transform. Yield the stamps at which all edges are now known.
 
         Yields
         ------
@@ -130,7 +130,7 @@ class TfStream:
             with located(f"transform {parent}:{frame}"):
                 check_pose(*row)
         pose = _matrices(row) if is_static else None
-        # The chain of edges changes if the edge is new, or if a static edge begins to move.
+        # The chain of edges changes if an edge is new, or if a static edge begins to move.
         if (
             was_static
             != self._tree.add(parent, frame, pose, is_static).is_static
@@ -145,7 +145,7 @@ class TfStream:
         return self._tree.pose(*self.source, matrices)
 
     def describe_missing(self) -> str:
-        """Return why there is no pose yet, as text for the user."""
+        """Return the reason why there is no pose yet, as text for the user."""
         try:
             up, down = self._tree.route(*self.source)
         except InputError as error:
@@ -158,7 +158,7 @@ class TfStream:
         return "its transforms have no common time"
 
     def _find_chain(self) -> None:
-        """Update the moving edges between both frames; none if the frames are not connected."""
+        """Update the moving edges between both frames; none if the frames are unconnected."""
         self._slowest = ""
         frames = []
         with suppress(InputError):
@@ -181,7 +181,7 @@ class TfStream:
         if last_ns - _JUMP_BACK_NS <= stamp_ns <= last_ns:
             return
         if stamp_ns < last_ns:
-            # The recording begins again.
+            # The recording has started again.
             self._slowest = ""
             self._last_ns.clear()
             for edge in self._moving.values():
@@ -193,7 +193,7 @@ class TfStream:
             yield from self._completed()
 
     def _completed(self) -> Iterator[tuple[int, dict[str, _Row]]]:
-        """Yield the stamps of the slowest edge that all other edges have reached.
+        """Yield the stamps of the slowest edge that all other edges have passed.
 
         Each stamp comes with the poses of the moving edges at this stamp, see :meth:`edges_at`.
         Stamps at which an edge cannot be interpolated are skipped.
@@ -218,7 +218,7 @@ class TfStream:
 
     def _find_slowest(self) -> str:
         """Return the moving edge with the lowest rate; empty until all rates can be estimated."""
-        # A single moving edge is the usual case. Its poses need not wait for an estimate of rates.
+        # Usually a single edge moves. Its poses need not wait for an estimate of rates.
         if len(self._moving) == 1:
             return next(iter(self._moving))
         if any(len(edge) < _RATE_FROM for edge in self._moving.values()):
@@ -235,9 +235,9 @@ def _interpolated(
 ) -> _Row | None:
     """Return the interpolated pose of an edge at a stamp (ns).
 
-    The result is None before the first pose, and between poses more than ``max_gap_s`` apart. The
-    stamp must not be later than the last pose. Poses before the stamp are removed from ``edge``, so
-    stamps must not decrease from call to call.
+    The result is None before the first pose, and in gaps of more than ``max_gap_s``. The stamp must
+    not be later than the last pose. Poses before the stamp are removed from ``edge``, so the stamps
+    of successive calls must not decrease.
     """
     while len(edge) > 1 and edge[1][0] <= stamp_ns:
         edge.popleft()

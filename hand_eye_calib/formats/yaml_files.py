@@ -1,8 +1,8 @@
 """Read YAML files of unknown origin within limits.
 
-Every YAML file of the package is read here, also JSON with comments and YAML of OpenCV. The values
-are those of JSON; a date is read as text. An error of one line is raised for other tags of YAML,
-repeated keys, aliases, and documents that are too large or too deeply nested.
+This module reads all YAML files of the package, including JSON with comments and YAML of OpenCV.
+The values are those of JSON; a date is read as text. Other tags of YAML, repeated keys, aliases,
+and documents that are too large or too deeply nested raise an error of one line.
 """
 
 import re
@@ -23,7 +23,7 @@ from hand_eye_calib.formats.files import (
     read_text,
 )
 
-# Largest number of characters of a whole number: 64 binary digits, with room for underscores.
+# Largest number of characters of an integer: 64 binary digits, with space for underscores.
 _LONGEST_INT = 100
 # Tags of YAML for the values of JSON.
 _TAGS = ("null", "bool", "int", "float", "str", "seq", "map")
@@ -73,7 +73,7 @@ class _Loader(_Base):
 def _whole_number(loader: Any, node: Any) -> int:
     """Return a whole number in any base; raise a ValueError if it does not fit into 64 bits.
 
-    The length of the text is checked first, because the conversion of long texts takes long.
+    The length of the text is checked first, because the conversion of a long text is slow.
     """
     is_short = len(node.value) <= _LONGEST_INT
     number = int(loader.construct_yaml_int(node)) if is_short else LARGEST_INT
@@ -98,7 +98,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
     ----------
     path : str or path-like
     expected : str
-        Description of the file that is expected, for errors.
+        Description of the expected file, for errors.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def read_yaml(path: str | Path, expected: str = "YAML") -> Any:
         return yaml.load(text, Loader=_Loader)
     # The loader raises errors of many types for values that do not fit their tags.
     except Exception as error:
-        # The parser names its source, which is always a text.
+        # The parser names its source. Remove this name, because the source is always a text.
         words = re.sub(r' in "<[a-z ]+>",', ",", " ".join(str(error).split()))
         reason = shortened(words, LONGEST_NAME // 2) or type(error).__name__
         raise UnreadableYamlError(

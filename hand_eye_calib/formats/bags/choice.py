@@ -1,7 +1,7 @@
-"""Choose topics of a bag for the streams that the user has not named.
+"""Choose the topics of a bag for streams that the user has not named.
 
-If only one choice is obvious, it is used. Otherwise an error lists the topics of the bag and the
-options that choose the likeliest pair.
+An obvious choice is used. Otherwise an error lists the topics of the bag, and the options for the
+likeliest pair.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -13,11 +13,11 @@ from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.bags import messages, roles
 from hand_eye_calib.formats.exports import role_of
 
-# Smallest number of poses on the topic of a sensor. Goals and initial poses are published once.
+# Fewest poses on the topic of a sensor. Goals and initial poses are published only once.
 _MIN_POSES = 3
 
-# Words in the names of topics whose poses are not measured by one sensor: they are commands, ground
-# truth, or estimates from several sensors.
+# Words in topic names of poses that no single sensor measures: commands, ground truth, and
+# estimates from several sensors.
 _NO_SENSOR = {
     "goal",
     "target",
@@ -29,7 +29,7 @@ _NO_SENSOR = {
     "filtered",
     "fused",
 }
-# Words in the names of topics that describe the kind of message, not the sensor.
+# Words in topic names that describe the kind of message instead of the sensor.
 _KINDS_OF_MESSAGES = {
     "odometry",
     "odom",
@@ -40,11 +40,11 @@ _KINDS_OF_MESSAGES = {
     "stamped",
     "local",
 }
-# Kinds of sensors that role_of distinguishes, the likeliest first. Its kind "base" is missing here,
-# because a vehicle is no sensor.
+# Kinds of sensors in role_of, the likeliest first. The kind "base" is left out, because a vehicle
+# is no sensor.
 _SENSORS = ("lidar", "camera", "imu", "gnss")
 
-# Largest number of characters of a list of topics in an error.
+# Largest number of characters in a list of topics in an error.
 _LONGEST_LIST = 600
 
 _FIX = "sensor_msgs/msg/NavSatFix"
@@ -67,7 +67,7 @@ class TopicInfo(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """Topic with poses, and the sensor's frame in its first message, which may be empty."""
+    """Topic with poses, and the sensor's frame in its first message, which may be missing."""
 
     topic: TopicInfo
     frame: str
@@ -78,17 +78,17 @@ class _Candidate(NamedTuple):
 
     @property
     def is_of_sensor(self) -> bool:
-        """Whether the poses may be measured by a sensor, judged by the topic's name."""
+        """Return whether a sensor may have measured the poses, according to the topic name."""
         return not words_of(self.name) & _NO_SENSOR
 
     @property
     def rank(self) -> int:
-        """Index of the sensor's kind in ``_SENSORS``; for other kinds, the number of kinds."""
+        """Index of the sensor's kind in ``_SENSORS``. Other kinds have the number of kinds."""
         role = role_of(self.name) or role_of(self.frame)
         return _SENSORS.index(role) if role in _SENSORS else len(_SENSORS)
 
     def has_sensor_of(self, other: "_Candidate") -> bool:
-        """Whether the poses of both topics are those of one sensor, judged by frames and names."""
+        """Return whether both topics are from one sensor, according to frames and names."""
         if self.frame and self.frame == other.frame:
             return True
         words = words_of(self.name) - _KINDS_OF_MESSAGES
@@ -100,7 +100,7 @@ class _Candidate(NamedTuple):
 def _of_types(
     topics: Sequence[TopicInfo], types: Collection[str], min_count: int = 0
 ) -> list[TopicInfo]:
-    """Return the topics with messages of some types, and with at least ``min_count`` messages."""
+    """Return the topics with at least ``min_count`` messages of the given types."""
     return [
         topic
         for topic in topics
@@ -123,7 +123,7 @@ def choose(
     missing : sequence of str
         Streams without a topic: "parent", "child" or both.
     frame_of : callable
-        Returns the sensor's frame in the first message of a topic.
+        Function that returns the sensor's frame in the first message of a topic.
     edges : collection of str
         Frames of the moving transforms in the bag, as WORLD:SENSOR.
 
@@ -168,11 +168,11 @@ def _partners(
     """Return the topics that may be the other stream of the sensors."""
     partners = topics
     if len(sensors) == 1 and sensors[0].frame:
-        # A topic of the same sensor cannot be the other stream.
+        # The other stream must be from another sensor.
         frame = sensors[0].frame
         partners = [topic for topic in topics if frame_of(topic.name) != frame]
     if n_missing == 1:
-        # Wheels are always the parent, which the user may have named already.
+        # Wheels are always the parent. The user may already have named the parent.
         partners = [
             topic for topic in partners if topic.type != messages.JOINTS_TYPE
         ]
@@ -204,9 +204,9 @@ def _unclear(
 ) -> UnclearStreamsError:
     """Return the error for a bag without an obvious choice.
 
-    The error contains the problem, and the options of the likeliest choice. If no choice is
-    possible, it contains what to record instead, and the topics of the bag. ``partners`` are the
-    topics that may belong to the other sensor if only one topic has poses.
+    The error contains the problem, and the options for the likeliest choice. If no choice is
+    possible, it contains what to record instead, and the topics of the bag. If only one topic has
+    poses, ``partners`` are the topics that may belong to the other sensor.
     """
     if not any(topic.count for topic in topics) and len(missing) > 1:
         return UnclearStreamsError("the bag has no messages: record again", {})
@@ -232,10 +232,10 @@ def _problem_and_sources(
     edges: Collection[str],
     n_missing: int,
 ) -> tuple[str, list[str]]:
-    """Return why the choice is unclear, and the possible sources of poses, the likeliest first.
+    """Return the reason why the choice is unclear, and the possible sources, the likeliest first.
 
-    Sources are topics of poses, pairs of frames in transforms, and clouds of points. ``sensors``
-    are the topics of poses.
+    Sources are topics with poses, pairs of frames in transforms, and clouds of points. ``sensors``
+    are the topics with poses.
     """
     pairs = _separate_edges(edges)
     clouds = _of_types(topics, {messages.POINTS_TYPE})
@@ -244,7 +244,7 @@ def _problem_and_sources(
         return problem, [topic.name for topic in sensors]
     if sensors:
         return _partners_of(sensors[0], topics, pairs)
-    # A topic that the user has named is not among the topics.
+    # A topic that the user has named is not in ``topics``.
     no_poses = (
         "no topic has poses" if n_missing > 1 else "no other topic has poses"
     )
@@ -273,7 +273,7 @@ def _problem_and_sources(
 def _partners_of(
     sensor: TopicInfo, topics: Sequence[TopicInfo], pairs: Sequence[str]
 ) -> tuple[str, list[str]]:
-    """Return that only one topic has poses, and the possible partners of this topic.
+    """Return the problem that only one topic has poses, and the possible partners of this topic.
 
     ``pairs`` are pairs of frames in transforms.
     """
@@ -294,13 +294,13 @@ def _partners_of(
 
 
 def _partial_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:
-    """Return the first topic of positions, else of rates; None if there is none."""
+    """Return the first topic with positions, otherwise with rates; None if there is none."""
     partial = [*_of_types(topics, {_FIX}), *_of_types(topics, {_IMU})]
     return partial[0] if partial else None
 
 
 def _advice(types: set[str], n_missing: int) -> str:
-    """Return what to do with a bag whose topics have messages of these types, but no poses."""
+    """Return advice for a bag without poses, given the types of its messages."""
     if messages.POINTS_TYPE in types:
         return "run the odometry of both sensors and record it; clouds of one lidar are one stream"
     if not types.isdisjoint(messages.IMAGE_TYPES):
@@ -312,7 +312,7 @@ def _advice(types: set[str], n_missing: int) -> str:
 
 
 def _separate_edges(edges: Collection[str]) -> list[str]:
-    """Return pairs WORLD:SENSOR that share no frame: each sensor has a world of its own."""
+    """Return pairs WORLD:SENSOR without a common frame: each sensor has its own world."""
     separate: list[str] = []
     used: set[str] = set()
     for edge in sorted(edges):
@@ -324,7 +324,7 @@ def _separate_edges(edges: Collection[str]) -> list[str]:
 
 
 def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Return the options that choose the first names, the likeliest, for the missing streams."""
+    """Return the options that choose the first (likeliest) names for the missing streams."""
     chosen = [*names[: len(missing)]]
     if len(chosen) > 1:
         chosen = roles.parent_and_child(chosen, {}, {})

@@ -1,7 +1,7 @@
 """Decode messages into objects through libraries.
 
-This works for every type whose definition is in the bag, but takes more time than unpacking the
-bytes of frequent types (``messages.py``).
+This works for every type whose definition is in the bag. For frequent types, unpacking the bytes is
+faster (``messages.py``).
 """
 
 import json

@@ -24,12 +24,12 @@ from hand_eye_calib.formats.bags.storage import (
 from hand_eye_calib.formats.saved_results import refuse_saved_result
 from hand_eye_calib.formats.yaml_files import read_yaml
 
-# What a path of a bag may be, for messages.
+# Possible paths of a bag, for messages.
 _EXPECTED = (
     "a rosbag2 directory, a .mcap or .db3 file of one, or a rosbag1 .bag file"
 )
-# Endings of files that SQLite keeps next to a .db3 while writing. If the recorder was killed, these
-# files contain its newest messages.
+# Endings of files that SQLite keeps beside a .db3 while writing. If the recorder was killed, they
+# contain the newest messages.
 _UNFINISHED = ("-wal", "-journal")
 _METADATA = "metadata.yaml"
 # Largest number of missing files that a message lists by name.
@@ -37,10 +37,10 @@ _MOST_NAMED = 5
 
 
 def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
-    """Open the storage files of bags; return them in the order of their first message.
+    """Open the storage files of bags. Return them in the order of their first messages.
 
-    Files that are compressed as a whole are unpacked into a temporary folder. ``opened`` closes the
-    files and removes these folders.
+    Completely compressed files are unpacked into a temporary folder. ``opened`` closes the files
+    and removes these folders.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
 
 
 def _unfinished(file: Path) -> list[Path]:
-    """Return the files next to a .db3 with its newest messages, which SQLite has not merged yet."""
+    """Return the files beside a .db3 with the newest messages, which are not merged yet."""
     if file.suffix != ".db3":
         return []
     paths = [file.with_name(f"{file.name}{suffix}") for suffix in _UNFINISHED]
@@ -82,10 +82,10 @@ def _unfinished(file: Path) -> list[Path]:
 
 
 def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
-    """Copy a database with its unfinished files, and let SQLite merge them in the copy.
+    """Copy a database with its unfinished files, and merge them in the copy.
 
-    A copy is needed because SQLite writes into the folder of a database even to read it, but the
-    user's folder must not change.
+    SQLite writes into the folder of a database even to read it, and the folder of the user must not
+    change. So a copy is needed.
     """
     try:
         shutil.copyfile(file, copy)
@@ -106,9 +106,9 @@ def _complete(file: Path, unfinished: Iterable[Path], copy: Path) -> None:
 
 
 def _unpack(file: Path, target: Path) -> str:
-    """Unpack a file that is compressed as a whole.
+    """Unpack a completely compressed file.
 
-    A damaged file is unpacked up to the damage. The returned line describes the damage; it is empty
+    A damaged file is unpacked up to the damage. The result is a line about the damage, and empty
     for an intact file.
     """
     zstd = zstd_module()
@@ -131,7 +131,7 @@ def _unpack(file: Path, target: Path) -> str:
 def _files_of(path: Path) -> list[Path]:
     """Return the storage files of a bag.
 
-    A compressed file is skipped if the same file is there uncompressed.
+    A compressed file is skipped if the same file also exists uncompressed.
 
     Raises
     ------
@@ -185,15 +185,15 @@ def _no_files(folder: Path) -> str:
 
 
 class MissingFiles(NamedTuple):
-    """Files that the metadata of a bag list, but that are not in its folder.
+    """Files that the metadata of a bag list, but that are missing in its folder.
 
     Attributes
     ----------
     n_messages : dict of str to int
-        Number of messages of each missing file, by file name. None if the metadata do not contain
-        the number; any type if the metadata are damaged.
+        Number of messages of each missing file, by file name. None if the metadata have no number;
+        any type if they are damaged.
     n_in_bag : int
-        Number of messages of the whole bag. None or any type, too, for the same reasons.
+        Number of messages of the whole bag, or None or any type for the same reasons.
     """
 
     n_messages: dict[str, Any]
@@ -231,8 +231,8 @@ def _listing(names: Iterable[str]) -> str:
 def losses_of(path: Path, n_present: int) -> list[str]:
     """Return a line about missing files of a bag, and the share of the messages in these files.
 
-    The list is empty if no file of the metadata is missing. ``n_present`` is the number of messages
-    in the files that are there.
+    The line is in a list, which is empty if no file is missing. ``n_present`` is the number of
+    messages in the present files.
     """
     if not path.is_dir():
         return []
@@ -241,7 +241,7 @@ def losses_of(path: Path, n_present: int) -> list[str]:
         return []
     counts = [count for count in missing.values() if isinstance(count, int)]
     n_missing = sum(counts)
-    # If the number is not known for all files, use the number of messages of the whole bag.
+    # If the number is unknown for a file, use the number of messages of the whole bag.
     if len(counts) < len(missing):
         n_missing = (
             max(n_in_bag - n_present, 0) if isinstance(n_in_bag, int) else 0

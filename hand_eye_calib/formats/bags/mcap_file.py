@@ -29,22 +29,22 @@ _RECORD = struct.Struct("<BQ")
 # Header of a message: channel (uint16) and log time in ns (uint64). The sequence number (4 bytes)
 # and the publish time (8 bytes) are skipped.
 _MESSAGE = struct.Struct("<H4xQ8x")
-# Schema for a channel that has no schema, as some channels with JSON.
+# Schema for a channel without a schema; some channels with JSON have none.
 _NO_SCHEMA = records.Schema(id=0, name="", encoding="", data=b"")
 
 
 class McapFile(Storage):
     """An .mcap file, read by the library mcap.
 
-    An intact file is read with the help of its index. In a damaged file, all records before the
-    damage are read. They include the first records of a chunk whose end is missing.
+    An intact file is read with its index. From a damaged file, all records before the damage are
+    read, including the first records of a chunk whose end is missing.
     """
 
     def _open(self, opened: ExitStack) -> None:
         self._stream = _WholeReads(
             opened.enter_context(self._file.open("rb", buffering=0))
         )
-        # Indexes of the chunks, sorted by time; empty if the file has no usable index.
+        # Indexes of the chunks, sorted by time. The list is empty if the file has no usable index.
         self._chunks: list[Any] = []
         try:
             summary = self._checked_summary()
@@ -69,7 +69,7 @@ class McapFile(Storage):
             )
 
     def _checked_summary(self) -> Any:
-        """Return the summary of the file; raise an error of any type if the summary is incomplete.
+        """Return the summary of the file. Raise an error of any type if the summary is incomplete.
 
         A summary without the index of all chunks is incomplete.
         """
@@ -85,7 +85,7 @@ class McapFile(Storage):
         return summary
 
     def _add_kind(self, channel: Any, schemas: Mapping[int, Any]) -> None:
-        """Store the kind of the messages of a channel; ``schemas`` are those of the file by id."""
+        """Store the kind of the messages of a channel. ``schemas`` has the file's schemas by id."""
         schema = schemas.get(channel.schema_id, _NO_SCHEMA)
         description = (
             schema.name,
@@ -96,9 +96,9 @@ class McapFile(Storage):
         self._kinds[channel.id] = kind_of(channel.topic, *description)
 
     def _scan(self, reason: Exception) -> None:
-        """Read a file without a usable index once, to count its messages and to find its damage.
+        """Read a file without a usable index once, to count its messages and to find the damage.
 
-        ``reason`` is the error that reading the index raised.
+        ``reason`` is the error raised when the index was read.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class McapFile(Storage):
         self, kinds: Mapping[int, MessageKind], span_ns: Span
     ) -> Iterable[Message]:
         if not self._chunks:
-            # Opening the file has added the damage to `losses` already, so pass another list.
+            # The damage is already in `losses`, so pass another list.
             for record in self._records([]):
                 if (
                     isinstance(record, records.Message)
@@ -153,7 +153,7 @@ class McapFile(Storage):
             if is_outside:
                 continue
             channels = index.message_index_offsets
-            # Skip chunks without messages of these kinds. A chunk may have no index of channels.
+            # Skip chunks without messages of these kinds. A chunk may lack an index of channels.
             if not channels or kinds.keys() & channels.keys():
                 messages = _messages_of_chunk(
                     self._content(index.chunk_start_offset), kinds
@@ -170,7 +170,7 @@ class McapFile(Storage):
         return bytes(stream.read(size))
 
     def _records(self, losses: list[str]) -> Iterator[Any]:
-        """Iterate over all records of the file, or over those before the damage.
+        """Iterate over all records of the file, or over the records before the damage.
 
         The reason of the damage is appended to ``losses``.
         """
@@ -186,12 +186,13 @@ class McapFile(Storage):
         except Exception as error:
             losses.append(reason_of(error))
             if isinstance(error, EOFError):
-                # The file is cut off. Reading the records of its last chunk ends in an error, too.
+                # The file is truncated. Reading the records of its last chunk also ends in an
+                # error.
                 with suppress(Exception):
                     yield from self._records_of_cut_chunk(position)
 
     def _records_of_cut_chunk(self, position: int) -> Iterator[Any]:
-        """Iterate over the records of a chunk at byte ``position``, whose end is missing.
+        """Iterate over the records of a truncated chunk at byte ``position``.
 
         There are none if the record at this position is not a chunk.
         """
@@ -241,13 +242,13 @@ def _messages_of_chunk(
 class _WholeReads(BufferedReader):
     """File whose ``read`` raises EOFError if fewer bytes than requested are left.
 
-    The library mcap would take fewer bytes for a whole record.
+    The library mcap would accept fewer bytes as a whole record.
     """
 
     def read(self, size: int | None = -1) -> bytes:
         n_bytes = size or 0
-        # Before version 1.6, the library mcap requests any length that a damaged file states. Too
-        # large a length would fill the memory.
+        # Before version 1.6, the library mcap requests any length that a damaged file states, which
+        # could fill the memory.
         data = super().read(size) if n_bytes < files.LARGEST else b""
         if len(data) < n_bytes:
             raise EOFError("it ends in the middle of a record")

@@ -1,4 +1,4 @@
-"""Types of messages that can be read, and the quantities (poses, rates, ...) that they contain.
+"""Readable types of messages, and the quantities (poses, rates, ...) in them.
 
 Messages of frequent types are unpacked from their bytes: a ``std_msgs/Header``, the sensor's frame
 in some types, and the values. This takes little time and needs no type definitions. Libraries
@@ -38,15 +38,16 @@ _NO_VECTOR = (math.nan,) * 3
 
 # ---- bytes
 
-# Number of bytes before the stamp. In CDR they are the encoding, and values are aligned relative to
-# their end. In ROS 1 they are a sequence number, and values are not aligned.
+# Number of bytes before the stamp. In CDR these bytes are the encoding, and values are aligned
+# relative to the end of them. In ROS 1 these bytes are a sequence number, and values are not
+# aligned.
 START = struct.calcsize("=I")
 # First bytes of a message in plain CDR, little endian.
 _CDR = b"\x00\x01"
 
 
 class Cursor:
-    """Reader of the values in the bytes of a message, one after the other.
+    """Read the values in the bytes of a message, one after the other.
 
     Raises
     ------
@@ -64,7 +65,7 @@ class Cursor:
         self.position = START
 
     def read(self, format_: str) -> tuple[Any, ...]:
-        """Read numbers; ``format_`` is a format of ``struct`` with numbers of the same size."""
+        """Read numbers. ``format_`` is a format of ``struct`` whose numbers have equal size."""
         if not self._is_ros1:
             self.position += (START - self.position) % struct.calcsize(
                 format_[-1]
@@ -115,8 +116,8 @@ def _imu(cursor: Cursor) -> Sequence[float]:
 
     A quantity is NaN if the message does not contain it.
     """
-    # Orientation (4 numbers) and its covariance (9), rates (3) and their covariance (9). The first
-    # element of a covariance is -1 if the message does not contain the quantity.
+    # Orientation (4 numbers) and its covariance (9), rates (3) and their covariance (9). A
+    # covariance that begins with -1 means that the message does not contain the quantity.
     values = cursor.read("25d")
     orientation = _NO_ROTATION if values[4] == -1.0 else values[:4]
     rates = _NO_VECTOR if values[16] == -1.0 else values[13:16]
@@ -135,15 +136,15 @@ def unpack_fix(cursor: Cursor) -> Sequence[float]:
 
 
 class MessageType(NamedTuple):
-    """Type of messages that can be read.
+    """Readable type of messages.
 
     Attributes
     ----------
     name : str
     measures : sequence of str
-        Quantities that can be read from the messages; the first is read by default.
+        Quantities in the messages. The first one is read by default.
     unpack : callable, optional
-        Reads the values after the names of the frames. None for types that a library decodes.
+        Function that reads the values after the frame names. None for types that a library decodes.
     has_child_frame : bool
         Whether the name of the sensor's frame follows the header.
     fields : str
@@ -158,7 +159,7 @@ class MessageType(NamedTuple):
 
 
 # Columns of each quantity in the values of :func:`unpack_pose`, :func:`_point`, :func:`_imu` and
-# :func:`unpack_fix`. Latitude, longitude and height are read as positions.
+# :func:`unpack_fix`. Latitude, longitude and height count as positions.
 COLUMNS = {
     "poses": slice(7),
     "positions": slice(3),
@@ -212,7 +213,7 @@ _NOVATEL = (
     "t=header.stamp,lat_deg=latitude,lon_deg=longitude,height=height,"
     "roll_deg=roll,pitch_deg=pitch,heading_deg=azimuth"
 )
-# Fields of types that a library decodes. If a message has an array of poses, the first is read.
+# Fields of types that a library decodes. From an array of poses, the first pose is read.
 _FIELDS = {
     "novatel_oem7_msgs/msg/INSPVA": _NOVATEL,
     "novatel_oem7_msgs/msg/INSPVAX": _NOVATEL,
@@ -276,13 +277,13 @@ _ROWS.append(MessageType(POINTS_TYPE, _OF_POSES))
 _ROWS.append(MessageType(JOINTS_TYPE, ("wheels", "steering", "tricycle")))
 
 MESSAGE_TYPES = {row.name: row for row in _ROWS}
-#: Types with a complete pose in each message, which is unpacked from the bytes.
+#: Types whose messages contain a complete pose that is unpacked from the bytes.
 POSE_TYPES = tuple(row.name for row in _ROWS if row.unpack is unpack_pose)
-#: Types whose header contains the sensor's frame, not a world frame.
+#: Types whose header contains the sensor's frame instead of a world frame.
 SENSOR_TYPES = tuple(
     row.name for row in _ROWS if row.unpack in (_imu, unpack_fix)
 )
-#: Types with a complete pose in each message, whose fields a library decodes.
+#: Types whose messages contain a complete pose, with fields that a library decodes.
 FIELD_POSE_TYPES = tuple(
     name
     for name, fields in _FIELDS.items()
@@ -298,7 +299,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     message_type : str
         Empty for transforms.
     wanted : str
-        Quantity that the user asks for, or "auto" for the usual quantity of the type.
+        Quantity that the user requests, or "auto" for the usual quantity of the type.
     source : object
         Name of the topic in the error.
 
@@ -325,7 +326,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
 def ns_of(stamp: Any) -> int | None:
     """Return a stamp in ns; None if the object is not a stamp.
 
-    Stamps of ROS, of Foxglove's JSON and of protobuf name their fields differently.
+    Stamps of ROS, of JSON in Foxglove and of protobuf have different field names.
     """
     for seconds, nanoseconds in (
         ("sec", "nanosec"),
@@ -346,7 +347,7 @@ def pose_row(position: Any, orientation: Any) -> tuple[float, ...]:
 
 
 def transform_of(message: Any) -> PoseFields:
-    """Return a transform of ROS or of Foxglove; names of frames lose their leading slash."""
+    """Return a transform of ROS or of Foxglove. Frame names lose their leading slash."""
     if hasattr(message, "header"):
         stamp = message.header.stamp
         parent = message.header.frame_id
@@ -362,7 +363,7 @@ def transform_of(message: Any) -> PoseFields:
 
 
 class Run(NamedTuple):
-    """Messages of one kind in the order of bag time, and their bag times (N,), ns."""
+    """Messages of one kind in the order of bag time, with their bag times (N,), ns."""
 
     kind: MessageKind
     messages: list[bytes]

@@ -1,4 +1,4 @@
-"""Find the bags in a folder, or those that match a pattern with ``*``."""
+"""Find the bags in a folder, or the bags that match a pattern with ``*``."""
 
 from fnmatch import fnmatchcase
 from glob import glob, has_magic
@@ -14,8 +14,8 @@ _SUFFIXES = (".bag", ".mcap", ".db3")
 def matching(pattern: str) -> list[str]:
     """Return the bags that match a pattern.
 
-    The pattern may be the path of a bag; a folder that is not a bag matches all bags below it. A
-    pattern with ``**`` matches bags only: other files, and files inside bags, are skipped.
+    The pattern may be the path of a bag. A folder that is not a bag matches all bags below it. A
+    pattern with ``**`` matches only bags; other files, and files inside bags, are skipped.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def matching(pattern: str) -> list[str]:
 
 
 def _no_match(pattern: str) -> str:
-    """Return the message for a pattern without a match: what was expected, and what is there."""
+    """Return the message for a pattern without a match: what was expected, and what exists."""
     path = Path(pattern)
     if has_magic(path.name) and path.suffix and path.suffix not in _SUFFIXES:
         advice = "check the folder and the name"
@@ -50,7 +50,7 @@ def _no_match(pattern: str) -> str:
 
 
 def _names_in_other_case(pattern: Path) -> list[str]:
-    """Return the files that match a pattern if upper and lower case are ignored."""
+    """Return the files that match a pattern if case is ignored."""
     if has_magic(str(pattern.parent)) or not pattern.parent.is_dir():
         return []
     return sorted(
@@ -61,17 +61,17 @@ def _names_in_other_case(pattern: Path) -> list[str]:
 
 
 def has_suffix_of_bag(path: Path) -> bool:
-    """Whether the name of a path ends as that of a file of a bag, which may be compressed."""
+    """Return whether a path has the suffix of a bag's file, which may be compressed."""
     return path.suffix in (*_SUFFIXES, ".zstd")
 
 
 def is_other_file(path: str) -> bool:
-    """Whether a path is a file, but not of a bag."""
+    """Return whether a path is a file that does not belong to a bag."""
     return Path(path).is_file() and not has_suffix_of_bag(Path(path))
 
 
 def _local_bags(pattern: str) -> list[str]:
-    """Return the paths on this computer that match a pattern; a plain path is not checked."""
+    """Return the paths on this computer that match a pattern. A plain path is not checked."""
     if not has_magic(pattern) or Path(pattern).exists():
         return [pattern]
     paths = sorted(glob(pattern, recursive=True))
@@ -89,7 +89,7 @@ def _is_folder_of_bags(path: Path) -> bool:
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether a path is a bag, and not a file inside a bag."""
+    """Return whether a path is a bag, instead of a file inside a bag."""
     if path.is_dir():
         return (path / "metadata.yaml").exists()
     return (

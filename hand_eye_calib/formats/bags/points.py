@@ -14,10 +14,10 @@ from hand_eye_calib.core.base.text import frame_name
 if TYPE_CHECKING:
     from hand_eye_calib.formats.bags.reader import PoseBag
 
-# numpy's name of each datatype of a PointField.
+# NumPy names of the datatypes of a PointField.
 _DATATYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 
-# Names that drivers use for the time of a point.
+# Names of the time of a point in the messages of various drivers.
 _TIME_FIELDS = (
     "t",
     "time",
@@ -27,8 +27,8 @@ _TIME_FIELDS = (
     "timeOffset",
     "ts",
 )
-# Longest duration of a scan (ns). Messages do not state the unit of the times of points. The
-# largest unit is assumed in which no scan is longer.
+# Longest duration of a scan (ns). Messages do not state the unit of the times of points. The unit
+# is assumed to be the largest one for which no scan is longer.
 _LONGEST_NS = 1e9
 
 
@@ -75,10 +75,10 @@ def rows_of_points(message: Any) -> Any:
 
 
 def times_of_points(rows: Any, header_ns: int) -> tuple[FloatArray, int]:
-    """Return the times (N,), s, of points since the middle of their scan, and its stamp (ns).
+    """Return the times (N,) of points (s) since the middle of their scan, and its stamp (ns).
 
-    ``rows`` are points of :func:`rows_of_points`, and ``header_ns`` is the stamp of the header. All
-    points count as measured at this stamp if the message has no times of points.
+    ``rows`` are points from :func:`rows_of_points`, and ``header_ns`` is the stamp of the header.
+    Without times of points, all points are assumed to be measured at this stamp.
     """
     times = np.zeros(len(rows))
     time_field = next(

@@ -21,14 +21,14 @@ class PoseTable(Columns):
     Attributes
     ----------
     streams : (N,) object array
-        "parent" or "child"; empty before the stream is known.
+        "parent" or "child"; empty until the stream is known.
     stamps_ns : (N,) int64 array
         Header stamps.
     world_frames, sensor_frames : (N,) object array
         Names of frames; None if the message type has no such field.
     poses : (N, 7) array
         Position x y z, m, and quaternion qx qy qz qw of the sensor in its world. For messages
-        without poses, such as angular rates, the values of the messages in any number of columns.
+        without poses, such as angular rates: their values, in any number of columns.
     bag_ns : (N,) int64 array
         Times at which the recorder received the messages.
     """
@@ -44,9 +44,9 @@ class PoseTable(Columns):
     def of(
         cls, stamps_ns: Any, poses: Any, world: Any = "", sensor: Any = None
     ) -> Self:
-        """Return a table without stream names. Its stamps (N,), ns, are also its bag times.
+        """Return a table without stream names. The stamps (N,), ns, are used as bag times.
 
-        ``world`` and ``sensor`` are either the frame of all poses, or the frame of each pose (N,).
+        ``world`` and ``sensor`` are a frame for all poses, or a frame for each pose (N,).
         """
         stamps_ns = np.array(stamps_ns, dtype=np.int64)
 
@@ -65,7 +65,7 @@ class PoseTable(Columns):
         )
 
     def recorded(self, stream: str, bag_ns: Any) -> Self:
-        """Return the table with the name of its stream and the bag times (N,) of its poses."""
+        """Return the table with a stream name and with the bag times (N,) of its poses."""
         streams = np.full(len(self), stream, dtype=object)
         return replace(
             self, streams=streams, bag_ns=np.array(bag_ns, dtype=np.int64)
@@ -75,7 +75,7 @@ class PoseTable(Columns):
     def joined(cls, tables: Iterable[Self]) -> Self:
         """Return the rows of one or more tables in the order of bag time."""
         table = cls.concatenate(*tables)
-        # Most bags are in order: do not copy their columns.
+        # Most bags are already in order. Do not copy their columns.
         is_sorted = (np.diff(table.bag_ns) >= 0).all()
         return (
             table

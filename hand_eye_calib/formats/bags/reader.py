@@ -35,10 +35,9 @@ from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 
 class PoseBag:
-    """Context manager that reads one bag, or several bags of one recording.
+    """Read one bag, or several bags of one recording (context manager).
 
-    The bags are read in the order of their times. Bags that were recorded at the same time are
-    merged.
+    The bags are read in the order of their times. Bags from the same time are merged.
 
     Parameters
     ----------
@@ -53,8 +52,9 @@ class PoseBag:
     start_ns, end_ns : int or None
         Bag times of the first and the last message; None without messages.
     shown : callable
-        Hook to report progress. ``shown(runs, n_messages, step, size_of)`` yields the runs of
-        messages. ``step`` is a text for the user; ``size_of(run)`` is the number of its messages.
+        Hook that reports progress. ``shown(runs, n_messages, step, size_of)`` yields the runs of
+        messages. ``step`` is a text for the user; ``size_of(run)`` returns the number of its
+        messages.
 
     Raises
     ------
@@ -110,9 +110,9 @@ class PoseBag:
 
     @property
     def warnings(self) -> list[str]:
-        """Lines about parts that cannot be read, and about skipped poses.
+        """Lines about unreadable parts, and about skipped poses.
 
-        The list is complete after all poses are read.
+        The list is complete after all poses were read.
         """
         warnings = [*self._notes]
         for storage in self._storages:
@@ -134,7 +134,7 @@ class PoseBag:
         return f"The bag has {topics or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
-        """Return the message type of a topic; empty for frames and for missing topics."""
+        """Return the message type of a topic; empty for pairs of frames and for missing topics."""
         return self.topics[source].type if source in self.topics else ""
 
     def _tf_topics(self) -> list[str]:
@@ -146,7 +146,7 @@ class PoseBag:
         ]
 
     def edges_on(self, topic: str) -> list[str]:
-        """Return the pairs of frames, ``parent:child``, in the first transforms on a topic.
+        """Return the pairs of frames ``parent:child`` in the first transforms on a topic.
 
         The list is empty for other topics. Raises InputError if the messages cannot be read.
         """
@@ -168,7 +168,7 @@ class PoseBag:
         ----------
         source : Source
         wanted : str
-            Quantity that the user asks for, or "auto" for the usual quantity of the messages.
+            Quantity that the user requests, or "auto" for the usual quantity of the messages.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class PoseBag:
         topic, _, fields = str(source).partition("?")
         if "=" not in fields:
             return messages.measured_as(self.type_of(topic), wanted, source)
-        # The source names fields of the messages, which determine the quantity.
+        # The source names fields of the messages. They determine the quantity.
         usual = sources.FieldReading("", topic, fields).measures
         if wanted == "auto":
             return usual
@@ -189,12 +189,12 @@ class PoseBag:
         return wanted
 
     def check(self, source: Source, taken: Sequence[Source] = ()) -> None:
-        """Raise InputError if a source cannot be read; the message lists the topics of the bag.
+        """Raise InputError if a source cannot be read. The message lists the topics of the bag.
 
-        ``taken`` are the sources of other sensors, which the message does not propose.
+        The message does not propose ``taken``, the sources of other sensors.
 
-        These are topics that are not in the bag or have no poses, and frames in a bag without
-        transforms.
+        A source cannot be read if its topic is missing or has no poses, or if its frames are in no
+        transform.
         """
         if isinstance(source, TfSource):
             if not self._tf_topics():
@@ -221,9 +221,9 @@ class PoseBag:
             self._check_type(topic)
 
     def _check_type(self, topic: str) -> None:
-        """Raise InputError if the messages of a topic cannot be read, unless fields are named.
+        """Raise InputError if the messages of a topic are unreadable and no fields are named.
 
-        The message states what the user can write instead of the topic alone.
+        The message contains what the user can write instead of the topic alone.
         """
         type_ = self.type_of(topic)
         if type_ in messages.MESSAGE_TYPES:
@@ -252,21 +252,20 @@ class PoseBag:
         """Choose the sources of the parent's and the child's poses.
 
         Sources that the user does not name must be obvious, see :mod:`.choice`. If no source is
-        named, the frames in ``frames`` decide which topic is the parent's. Otherwise the parent is
-        the topic whose name contains parent, base or lidar, or the first topic by name.
+        named, ``frames`` decides which topic is the parent's. Without ``frames``, the parent is the
+        topic with parent, base or lidar in its name, or the first topic by name.
 
         Parameters
         ----------
         parent, child : Source, optional
             Sources as the user names them.
         frames : mapping of str to str, optional
-            Frames of the sensors that the user sets for "parent" or "child".
+            Frames that the user sets for "parent" or "child".
 
         Raises
         ------
         InputError
-            If a named source cannot be used, if both sources are the same, or if there is no
-            obvious choice.
+            If a named source is unusable, if both sources are the same, or if no choice is obvious.
         """
         named = [source for source in (parent, child) if source]
         for source in named:
@@ -292,7 +291,7 @@ class PoseBag:
     def _by_role(
         self, topics: Sequence[str], frames: Mapping[str, str]
     ) -> tuple[str, str]:
-        """Sort two topics: first that of the parent, then that of the child."""
+        """Sort two topics: first the parent's, then the child's."""
         sensors = {}
         if any(frames.values()):
             sensors = {topic: self.sensor_frame(topic) for topic in topics}
@@ -302,10 +301,10 @@ class PoseBag:
     def _choice(
         self, missing: Sequence[str], used: Collection[Source]
     ) -> list[str]:
-        """Return the topics for the missing streams, "parent" or "child" or both.
+        """Return the topics for the missing streams: "parent", "child" or both.
 
-        Raises UnclearStreamsError if no choice is obvious. ``used`` are sources that the user
-        names.
+        Raises UnclearStreamsError if no choice is obvious. ``used`` are the sources that the user
+        named.
         """
         free = [
             topic for topic in self.topics.values() if topic.name not in used
@@ -317,7 +316,7 @@ class PoseBag:
         return choose(free, missing, self.sensor_frame, moving_edges)
 
     def sensor_frame(self, topic: str) -> str:
-        """Return the sensor's frame in the first message of a topic; empty if it has none."""
+        """Return the sensor's frame in the first message of a topic; empty if it is missing."""
         type_ = self.type_of(topic)
         if type_ not in (*messages.POSE_TYPES, *messages.SENSOR_TYPES):
             return ""
@@ -359,7 +358,7 @@ class PoseBag:
         ----------
         parent, child : Source
         max_gap_s : float
-            Largest time between two transforms (s), between which poses are interpolated.
+            Largest time (s) between two transforms that are interpolated.
         measures : mapping of str to str, optional
             Quantities to read from the topics of "parent" and "child", see :meth:`measured`.
         stamps : mapping of str to str, optional
@@ -381,7 +380,7 @@ class PoseBag:
     def _poses_of(
         self, readings: Sequence[Reading], stamps: Mapping[str, str]
     ) -> PoseTable:
-        """Read the poses of streams in the order of bag time; ``stamps`` are those of `poses`."""
+        """Read the poses of streams in the order of bag time. For ``stamps`` see `poses`."""
         topics: set[str] = set()
         for reading in readings:
             reading.use_stamps(stamps.get(reading.stream, "header"))
@@ -408,7 +407,7 @@ class PoseBag:
     ) -> Reading:
         """Return the reader for a source. ``stream`` is "parent" or "child"."""
         if isinstance(source, TfSource):
-            # Raise an InputError if the frames are not connected.
+            # This raises an InputError if the frames are unconnected.
             self.static_frames.route(*source)
             tf_stream = TfStream(source, max_gap_s, self.static_frames)
             return sources.TransformReading(
@@ -437,9 +436,9 @@ class PoseBag:
     def _reading_of_several_poses(
         self, stream: str, topic: str, type_: str
     ) -> Reading:
-        """Return the reader for a topic whose messages are not a pose each.
+        """Return the reader for a topic whose messages do not contain a single pose.
 
-        These are paths, clouds, and fixes with the rotations of another topic.
+        Such messages are paths, clouds, or positions whose rotations come from another topic.
         """
         if type_ == messages.PATH_TYPE:
             return sources.PathReading(stream, topic)
@@ -474,7 +473,7 @@ class PoseBag:
         stamps : {"header", "receive"}
             See :meth:`poses`.
         stream : {"parent", "child"}
-            Stream whose options an error names.
+            Stream whose options are named in errors.
 
         Returns
         -------
@@ -509,8 +508,9 @@ class PoseBag:
     def static_frames(self) -> FrameTree:
         """Tree of all frames in the bag, with the poses of the static transforms.
 
-        The last of repeated static transforms counts. Invalid transforms are skipped with a note,
-        as in tf2. Raises InputError if the frames do not form a tree, or if a message is damaged.
+        If a static transform is repeated, the last one is used. Invalid transforms are skipped with
+        a note, as in tf2. Raises InputError if the frames do not form a tree, or if a message is
+        damaged.
         """
         tree = FrameTree("the bag's transforms")
         notes = {}
@@ -533,11 +533,10 @@ class PoseBag:
     def runs(
         self, topics: Collection[str], span_ns: Span = ALWAYS
     ) -> Iterator[Run]:
-        """Iterate over the messages of some topics in the order of bag time, in runs of one kind.
+        """Iterate over the messages of topics in the order of bag time, in runs of one kind.
 
-        A run has the messages of one kind in a block of a file. Files that were recorded at the
-        same time are read one after the other. Only messages whose bag time (ns) is in ``span_ns``
-        are read.
+        A run has the messages of one kind in a block of a file. Files from the same time are read
+        one after the other. Only messages with a bag time (ns) in ``span_ns`` are read.
         """
         start_ns, stop_ns = span_ns
         for storage in self._storages:
@@ -554,7 +553,7 @@ class PoseBag:
 
 
 def _bag_times(bag_ns: Sequence[int]) -> IntArray:
-    """Return bag times (N,), ns, as int64. Times out of range, as in damaged bags, are clipped."""
+    """Return bag times (N,), ns, as int64. Times out of range, from damaged bags, are clipped."""
     try:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:

@@ -1,4 +1,4 @@
-"""Decide which of two topics of poses is the parent, and which the child."""
+"""Decide which of two topics with poses is the parent, and which is the child."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -7,21 +7,21 @@ from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.exports import role_of
 
-# Words in the names of topics, from the likeliest parent to the likeliest child. The empty word is
-# for topics without any of the other words.
+# Words in topic names, from the likeliest parent to the likeliest child. The empty word represents
+# topics with none of the other words.
 _WORDS = ("parent", "joint", "base", "lidar", "", "child")
 
-# Words that many names of frames contain, so that a common word does not mean the same sensor.
+# Common words in frame names. They do not indicate that two frames are of the same sensor.
 _COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}
 
-# Scores, added up, of a topic for a sensor's frame that the user sets. Only their order matters.
-# The messages name the same frame.
+# The next four scores of a topic, for a frame that the user sets, are added up. Only their order
+# matters. Score if the messages have the same frame.
 _SAME_NAME = 8.0
-# For each word that the frame has in common with the topic or with the frame in its messages.
+# Score for each word that the frame shares with the topic, or with the frame in its messages.
 _SAME_WORD = 2.0
-# The names of the frame and of the topic indicate the same kind of sensor.
+# Score if the names of the frame and of the topic indicate the same kind of sensor.
 _SAME_KIND = 1.0
-# The messages name no frame. If they name a different frame, the score is 0.
+# Score if the messages have no frame. A different frame has the score 0.
 _NO_NAME = 0.5
 
 
@@ -34,14 +34,14 @@ def parent_and_child(
     ----------
     topics : sequence of 2 str
     frames : mapping of str to str
-        Frames of the sensors of "parent" and "child" that the user set; empty if not set.
+        Frames that the user set for "parent" and "child"; empty if not set.
     sensors : mapping of str to str
-        Frame of the sensor in the messages of each topic; empty if the messages name no frame.
+        Frame of the sensor in the messages of each topic; empty if the messages have none.
 
     Raises
     ------
     InputError
-        If the user sets a frame, and both orders of the topics fit it equally well.
+        If the user set a frame, and both orders of the topics fit it equally well.
     """
     by_words = sorted(topics, key=_parent_first)
     named = {stream: frame for stream, frame in frames.items() if frame}
@@ -68,7 +68,7 @@ def parent_and_child(
 
 
 def _match(frame: str, topic: str, sensor: str) -> float:
-    """Return a score: the higher it is, the more likely ``frame`` is the frame of a topic's sensor.
+    """Return a score for ``frame``, which is higher if the topic's sensor probably has this frame.
 
     ``sensor`` is the frame of the sensor in the topic's messages.
     """
@@ -88,7 +88,7 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 
 
 def _parent_first(topic: str) -> tuple[int, str]:
-    """Return a sort key that puts the likeliest parent first; equal topics are sorted by name."""
+    """Return a sort key with the likeliest parent first. Equal topics are sorted by name."""
     words = {*re.split(r"[/_:]+", topic.lower()), ""}
     if "child" in words:
         return _WORDS.index("child"), topic

@@ -1,14 +1,13 @@
 """Sources of a stream in a bag.
 
-A source is what the poses of the parent or of the child are read from: a topic of poses, a topic of
-positions joined with a topic of orientations, a path, the points of a lidar, images of a target,
+The poses of the parent or of the child are read from a source: a topic with poses, a topic with
+positions joined with a topic with orientations, a path, the points of a lidar, images of a target,
 fields of any message, or transforms between two frames.
 
 Fields are written ``/topic?t=header.stamp,x=pose.position.x,...``. The names before the equals
-signs are those of csv columns, with their units. Velocities and angular rates vx, vy, vz, wx, wy,
-wz are integrated to poses. A target is written
-``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``. ``@FILE`` at the end names the file of the
-camera's intrinsics.
+signs are those of csv columns, with their units. Velocities and angular rates (vx, vy, vz, wx, wy,
+wz) are integrated to poses. A target is written ``/camera/image_raw?charuco:5x7:0.04:0.03:4X4_50``.
+``@FILE`` at the end names the file with the camera's intrinsics.
 """
 
 from abc import ABC, abstractmethod
@@ -39,17 +38,17 @@ from hand_eye_calib.formats.transforms import TfSource, TfStream
 
 Source = str | TfSource
 
-# A stamp is wrong only if the delay of its message jumps by more than this (s), see
+# A stamp can only be wrong if the delay of its message jumps by more than this (s), see
 # `are_believable`. On a busy computer, the delays of correct messages jump by less.
 _JUMP_S = 0.5
-# All stamps of a topic are unusable if this share of them is 0, or repeats another stamp.
+# All stamps of a topic are unusable if this share of them, or more, is 0 or repeated.
 _MOSTLY = 0.5
 
 _NO_POSES = PoseTable.of([], np.empty((0, 7)))
 
 
 def source_of(text: str) -> Source:
-    """Return the source that a user names: a topic as text, or ``WORLD:SENSOR`` as two frames."""
+    """Return the source that the user names: a topic as text, or ``WORLD:SENSOR`` as two frames."""
     topic, _, _ = text.partition("?")
     return TfSource.parse(text) if ":" in topic else text
 
@@ -57,7 +56,7 @@ def source_of(text: str) -> Source:
 class Reading(ABC):
     """Base class of the readers of one stream. Each kind of source has a subclass.
 
-    The caller passes all messages of the topics to :meth:`take`, and then calls :meth:`table`.
+    The caller passes all messages of the topics to :meth:`take`, then calls :meth:`table`.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Reading(ABC):
     topics : tuple of str
         Topics whose messages are needed.
     notes : list of str
-        Notes for the user; complete after :meth:`table`.
+        Notes for the user, complete after :meth:`table`.
     """
 
     def __init__(self, stream: str, *topics: str) -> None:
@@ -77,7 +76,7 @@ class Reading(ABC):
 
     @property
     def name(self) -> str:
-        """Name of the source for the user."""
+        """Name of the source for messages to the user."""
         return "+".join(self.topics)
 
     def use_stamps(self, stamps: str) -> None:
@@ -86,20 +85,20 @@ class Reading(ABC):
         Raises
         ------
         ConfigError
-            For "receive", if several poses were received in one message.
+            For "receive", if a message contains several poses.
         """
         self.stamps = stamps
 
     @abstractmethod
     def take(self, run: messages.Run) -> None:
-        """Read the next messages of one of the topics; raise InputError if they are unusable."""
+        """Read the next messages of a topic. Raise InputError if they are unusable."""
 
     @abstractmethod
     def table(self) -> PoseTable:
-        """Return the poses of all messages; raise InputError if they cannot contain any pose."""
+        """Return the poses of all messages. Raise InputError if they cannot contain a pose."""
 
     def _stamped(self, table: PoseTable) -> PoseTable:
-        """Return the table with the stamps that were set, without poses whose header stamp is 0.
+        """Return the table with the chosen stamps, without poses whose header stamp is 0.
 
         Raises InputError if the header stamps are unusable.
         """
@@ -113,7 +112,7 @@ class Reading(ABC):
         is_zero = table.stamps_ns == 0
         n_zero = int(is_zero.sum())
         self._refuse_zeros(n_zero, len(table))
-        # Keep a single stamp 0, because a simulation may begin at 0.
+        # A single stamp may be 0, because a simulation can begin at 0.
         if n_zero > 1:
             self.notes.append(
                 f"{self.name}: {n_zero:,} poses were left out: their header stamps are 0"
@@ -132,7 +131,7 @@ class Reading(ABC):
             )
 
     def _refuse_whole_seconds(self, stamps_ns: IntArray) -> None:
-        """Raise InputError if header stamps are whole seconds and many of them are repeated."""
+        """Raise InputError if header stamps are whole seconds, many of them repeated."""
         if (stamps_ns % messages.NS_PER_S).any():
             return
         n_stamps = len(np.unique(stamps_ns))
@@ -145,13 +144,13 @@ class Reading(ABC):
             )
 
     def _note_null(self, n_null: int, n_all: int) -> None:
-        """Add a note about skipped poses whose quaternion is 0 or whose values are not finite."""
+        """Add a note about skipped poses: the quaternion is 0, or a value is not finite."""
         if n_null:
             self.notes.append(f"{self.name}: {without_poses(n_null, n_all)}")
 
 
 class TopicReading(Reading):
-    """Reader of a topic with a pose, a position, an orientation or angular rates per message."""
+    """Read a topic with one pose, position, orientation or angular rate per message."""
 
     def __init__(
         self, stream: str, topic: str, message_type: str, measures: str
@@ -196,11 +195,11 @@ class TopicReading(Reading):
 
 
 def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
-    """Detect single stamps that jump away from bag time.
+    """Return a mask without the single stamps that jump away from bag time.
 
-    A single wrong stamp may extend a recording of minutes to years. The delay of a message is its
-    bag time minus its stamp, d_i. A stamp is wrong if both abs(d_i - d_(i-1)) and
-    abs(d_i - d_(i+1)) exceed ``_JUMP_S`` + abs(d_(i+1) - d_(i-1)) + the median step of delays.
+    A single wrong stamp may extend a recording of minutes to years. The delay d_i of a message is
+    its bag time minus its stamp. A stamp is wrong if both abs(d_i - d_(i-1)) and abs(d_i - d_(i+1))
+    exceed ``_JUMP_S`` + abs(d_(i+1) - d_(i-1)) + the median step of the delays.
 
     Parameters
     ----------
@@ -215,7 +214,7 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
     if len(stamps_ns) < 3:
         return np.ones(len(stamps_ns), dtype=bool)
     delays_s = np.asarray(bag_ns - stamps_ns, dtype=float) * 1e-9
-    # The first message is compared with the two messages after it, the last with the two before.
+    # Compare the first message with the two after it, and the last message with the two before it.
     padded_s = np.r_[delays_s[2], delays_s, delays_s[-3]]
     steps_s = np.abs(np.diff(padded_s))
     smaller_steps_s = np.minimum(steps_s[:-1], steps_s[1:])
@@ -225,7 +224,7 @@ def are_believable(stamps_ns: IntArray, bag_ns: IntArray) -> BoolArray:
 
 
 class JoinedReading(Reading):
-    """Reader of positions on one topic and orientations on another topic.
+    """Read positions from one topic, and orientations from another topic.
 
     The orientations are interpolated at the stamps of the positions.
     """
@@ -266,10 +265,10 @@ class JoinedReading(Reading):
 
 
 class PathReading(Reading):
-    """Reader of the poses in the newest message of a path.
+    """Read the poses in the newest message of a path.
 
-    A path is published again each time it grows, and earlier poses may then be corrected. The
-    stamps of the poses are also used as their bag times.
+    A path is published again when it grows, and earlier poses may then be corrected. The stamps of
+    the poses are also their bag times.
     """
 
     _newest: messages.Run | None = None
@@ -309,7 +308,7 @@ class PathReading(Reading):
 
 
 class FieldReading(Reading):
-    """Reader of fields that the user names, in messages of any type.
+    """Read fields that the user names, in messages of any type.
 
     Attributes
     ----------
@@ -319,7 +318,7 @@ class FieldReading(Reading):
     Raises
     ------
     ConfigError
-        If the fields are not written NAME=PATH,...
+        If the fields are not in the form NAME=PATH,...
     InputError
         If the fields are angular rates without velocities.
     """
@@ -406,9 +405,9 @@ def _integrated(stamps_ns: IntArray, twists: FloatArray) -> FloatArray:
 
 
 class TransformReading(Reading):
-    """Reader of the transform between two frames, composed of a chain of transforms.
+    """Read the transform between two frames from a chain of transforms.
 
-    The poses have the stamps of the moving transform in the chain that has the lowest rate.
+    The poses have the stamps of the slowest moving transform in the chain.
     """
 
     def __init__(
@@ -419,7 +418,8 @@ class TransformReading(Reading):
             *(topic for topic in topics if not topic.endswith("tf_static")),
         )
         self._source = source
-        # For each pose: bag time, stamp, and x y z qx qy qz qw of each moving transform by frame.
+        # For each pose: bag time, stamp, and by frame the values x y z qx qy qz qw of each moving
+        # transform.
         self._poses: list[tuple[int, int, Any]] = []
         self._n_null = 0
         self._n_zero = 0

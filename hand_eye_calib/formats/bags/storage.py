@@ -1,6 +1,6 @@
-"""Read one storage file of a bag: base class, and files that the library rosbags reads.
+"""Read one storage file of a bag: base class, and formats of the library rosbags.
 
-rosbags reads the formats sqlite3 (.db3) and rosbag1 (.bag).
+These formats are sqlite3 (.db3) and rosbag1 (.bag).
 """
 
 import math
@@ -30,7 +30,7 @@ REPAIRS = {
     ".db3": "sqlite3's '.recover'",
     ".bag": "'rosbag reindex'",
 }
-# First bytes of a message that is compressed with zstd. Plain CDR never begins with these bytes.
+# First bytes of a message that is compressed with zstd. Plain CDR never has these first bytes.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 # Length in bytes (uint32) before the header and before the data of a rosbag1 record.
 _LENGTH = struct.Struct("<I")
@@ -39,7 +39,7 @@ _MESSAGE_OP = b"op=\x02"
 
 
 class MessageKind(NamedTuple):
-    """What messages of one connection or channel have in common.
+    """Common properties of the messages of a connection or channel.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class MessageKind(NamedTuple):
 # A recorded message: kind, bag time (ns) and bytes.
 Message: TypeAlias = tuple[MessageKind, int, bytes]
 
-# Bag times (ns) from the first, which is included, to the second, which is not.
+# Half-open interval of bag times (ns): the first is included, the second is not.
 Span: TypeAlias = tuple[float, float]
 ALWAYS: Span = (-math.inf, math.inf)
 
@@ -74,8 +74,8 @@ ALWAYS: Span = (-math.inf, math.inf)
 def kind_of(
     topic: str, name: str, encoding: str, language: str, content: bytes
 ) -> MessageKind:
-    """Return the kind of a connection's messages; equal connections get the same object."""
-    # ROS 1 names types package/Type, ROS 2 package/msg/Type.
+    """Return the kind of a connection's messages. Equal connections get the same object."""
+    # ROS 1 has type names package/Type, and ROS 2 package/msg/Type.
     if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
     return MessageKind(
@@ -92,7 +92,7 @@ def printable_name(name: str) -> str:
 
 
 class DamageError(ValueError):
-    """Error for a damaged file without a readable message; its text is the whole reason."""
+    """Error for a damaged file without a readable message. Its text is the complete reason."""
 
 
 class Storage(ABC):
@@ -101,11 +101,11 @@ class Storage(ABC):
     Parameters
     ----------
     paths : list of Path
-        File of the user, and the files of SQLite next to it.
+        The user's file, and the files that SQLite keeps beside it.
     file : Path
-        File that is read: the file of the user, or an unpacked copy.
+        The file that is read: the user's file, or an unpacked copy.
     opened : ExitStack
-        Closes the storage file when it is closed itself.
+        Exit stack that closes the storage file.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class Storage(ABC):
     span_ns : (first, last) or ()
         Bag times of the first and the last message; empty without messages.
     losses : list of str
-        One line for each part of the file that cannot be read.
+        A line for each part of the file that is unreadable.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class Storage(ABC):
     def _messages(
         self, kinds: Mapping[int, MessageKind], span_ns: Span
     ) -> Iterable[Message]:
-        """Yield the messages of some kinds; those outside a span of bag times may be skipped."""
+        """Yield the messages of some kinds. Messages outside a span of bag times may be skipped."""
 
     def blocks(
         self, topics: Collection[str], span_ns: Span = ALWAYS
@@ -175,10 +175,11 @@ class Storage(ABC):
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Context in which a library reads the file: limit its memory and convert its errors.
+        """Limit memory and convert errors while a library reads the file (context manager).
 
-        The libraries raise errors of many types for damaged files. Each becomes an InputError of
-        one line. Little other code runs in this context, so its defects are not hidden.
+        For damaged files, the libraries raise errors of many types. They become an InputError of
+        one line. Hardly any other code runs in this context, so defects of this package are not
+        hidden.
         """
         try:
             with files.reading_memory():
@@ -206,15 +207,15 @@ class Storage(ABC):
 class RosbagsFile(Storage):
     """A .db3 or .bag file, read by the library rosbags.
 
-    This class also reads intact .mcap files of ROS 2 if the library mcap is missing, because rosdep
-    cannot install the library mcap.
+    If the library mcap is missing, because rosdep cannot install it, this class also reads intact
+    .mcap files of ROS 2.
     """
 
     def _open(self, opened: ExitStack) -> None:
         suffix = self._file.suffix
         reader = rosbags(1 if suffix == ".bag" else 2).Reader(self._file)
         self._reader = reader
-        # rosbags passes the path to SQLite as a URI, so characters such as % must be escaped.
+        # rosbags passes the path to SQLite as a URI. Characters such as % must be escaped.
         if suffix == ".db3":
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
@@ -223,7 +224,7 @@ class RosbagsFile(Storage):
             )
         reader.open()
         opened.callback(reader.close)
-        # rosbags reads only the messages in the index of an mcap file, so it must be complete.
+        # rosbags reads only messages in the index of an mcap file. So the index must be complete.
         if suffix == ".mcap":
             n_indexed = sum(
                 sum(chunk.channel_count.values())
@@ -269,7 +270,7 @@ class RosbagsFile(Storage):
     ) -> Iterator[Message]:
         """Iterate over messages of rosbag1 in the order of bag time.
 
-        The messages are read at the positions in the library's index. The library's own iteration
+        The messages are read at the positions in the library's index. The iteration of the library
         takes 1.7 times as long.
         """
         reader = self._reader
@@ -295,7 +296,7 @@ class RosbagsFile(Storage):
 def _rosbag1_message(chunk: bytes, start: int) -> bytes:
     """Return the message at byte ``start`` of a chunk.
 
-    A record of the connection may precede the message; it is skipped.
+    If a record of the connection precedes the message, it is skipped.
     """
     end = start
     is_message = False
@@ -315,7 +316,7 @@ def _rosbag1_message(chunk: bytes, start: int) -> bytes:
 def reason_of(error: BaseException) -> str:
     """Return the type and the text of an error in one line.
 
-    The text of an EOFError or a DamageError is clear without the type.
+    An EOFError or a DamageError is clear without its type.
     """
     words = " ".join(str(error).split())
     if isinstance(error, EOFError | DamageError) and words:
@@ -329,7 +330,7 @@ def rosbags(version: int) -> Any:
 
 
 def message_blocks(messages: Iterable[Message]) -> Iterator[list[Message]]:
-    """Group messages into blocks of about ``BLOCK_BYTES``; decompress messages packed with zstd."""
+    """Group messages into blocks of about ``BLOCK_BYTES``. Decompress messages packed with zstd."""
     block = list[Message]()
     size = 0
     for kind, bag_ns, data in messages:

@@ -1,4 +1,4 @@
-"""Unpack messages from their bytes, as tables of poses or of what a topic measures."""
+"""Unpack messages from their bytes into tables of poses or of other quantities of a topic."""
 
 import struct
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ from hand_eye_calib.formats.transforms import PoseFields
 
 
 class _Unpacked(NamedTuple):
-    """Fields of a message. ``end`` is the number of bytes up to the end of the values."""
+    """Fields of a message. ``end`` is the number of bytes until the end of the values."""
 
     stamp_ns: int
     world_frame: str
@@ -49,7 +49,7 @@ class _Frames(NamedTuple):
     Attributes
     ----------
     data : bytes
-        Bytes of the message between its stamp and its pose, which contain the names of the frames.
+        Bytes of the message between its stamp and its pose. They contain the frame names.
     end : int
         Number of bytes of the message before the pose.
     world_frame, sensor_frame : str
@@ -62,7 +62,7 @@ class _Frames(NamedTuple):
 
 
 def _unpack(row: MessageType, is_ros1: bool, data: bytes) -> _Unpacked:
-    """Unpack one message; raise an error of ``MALFORMED`` if it is not of the type of the row."""
+    """Unpack one message. Raise an error of ``MALFORMED`` if it is not of the row's type."""
     cursor = Cursor(data, is_ros1)
     stamp_ns = cursor.stamp_ns()
     world_frame = cursor.name()
@@ -78,8 +78,8 @@ def unpack_poses(
 ) -> PoseTable:
     """Unpack messages of a type in MESSAGE_TYPES.
 
-    Raises an error of ``MALFORMED`` if a message is not of this type. Poses with equal frames are
-    unpacked together, which takes less time.
+    Raises an error of ``MALFORMED`` if a message is not of this type. To save time, poses with
+    equal frames are unpacked together.
     """
     row = MESSAGE_TYPES[message_type]
     if row.unpack is unpack_pose and len(messages) > 1:
@@ -96,8 +96,8 @@ def _unpack_alike(
 ) -> PoseTable | None:
     """Unpack poses together, as columns of the bytes of all messages.
 
-    Return None if the messages differ in length or in frames, or if a stamp is invalid. They must
-    then be unpacked one by one.
+    The result is None if the messages differ in length or in frames, or if a stamp is invalid. They
+    must then be unpacked singly.
     """
     size = len(messages[0])
     if any(len(data) != size for data in messages):
@@ -105,8 +105,8 @@ def _unpack_alike(
     first = _unpack(row, is_ros1, messages[0])
     rows = np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(-1, size)
     encodings = rows[:, :2]
-    # In CDR these bytes are the encoding, which must be the same. In ROS 1 they belong to the
-    # sequence number.
+    # In CDR these bytes are the encoding, which must be equal. In ROS 1 they belong to the sequence
+    # number.
     has_same_encoding = is_ros1 or (encodings == encodings[0]).all()
     frames = rows[:, START + STAMP_SIZE : first.end - POSE_SIZE]
     stamps = np.ascontiguousarray(rows[:, START : START + STAMP_SIZE])
@@ -125,10 +125,10 @@ def _unpack_alike(
 
 
 class MessageReader:
-    """Reader of the messages of one topic, in their order, as poses.
+    """Read the messages of one topic as poses, in their order.
 
-    Angular rates are integrated to orientations. If the messages contain no orientation, the poses
-    have the identity as a placeholder; if they contain no position, the poses are at the origin.
+    Angular rates are integrated to orientations. If the messages have no orientation, the poses
+    have the identity. If they have no position, the poses are at the origin.
 
     Parameters
     ----------
@@ -136,13 +136,13 @@ class MessageReader:
     measures : str
         Quantity to read, see :func:`.messages.measured_as`.
     origin : LocalOrigin, optional
-        Point from which latitudes and longitudes are converted to metres; by default, the first
+        Origin for the conversion of latitudes and longitudes to metres; by default, the first
         position.
 
     Attributes
     ----------
     n_left_out : int
-        Number of messages without the quantity: null poses, no fix, no orientation.
+        Number of messages without the quantity: null poses, no fix, or no orientation.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class MessageReader:
             message_type in POSE_TYPES and self._measures == "poses"
         )
         self._rates = RateIntegrator()
-        # Frames of the previous pose. The first value differs from the bytes of every message.
+        # Frames of the previous pose. The initial value differs from the bytes of every message.
         self._frames = _Frames(
             data=b" ", end=0, world_frame="", sensor_frame=None
         )
@@ -173,8 +173,8 @@ class MessageReader:
         -------
         PoseTable
         (N,) bool array
-            True for messages that contain the quantity. The poses of other messages are NaN, or as
-            the message contains them.
+            Whether each message contains the quantity. The poses of other messages are NaN, or as
+            in the message.
 
         Raises
         ------
@@ -212,7 +212,7 @@ class MessageReader:
     def _measured(self, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
         """Return positions (N, 3), m, or quaternions (N, 4) from the values of N messages.
 
-        Rates are integrated; latitude, longitude (deg) and height become metres.
+        Rates are integrated. Latitude, longitude (deg) and height are converted to metres.
         """
         if self._measures == "rates":
             return se3.to_quat_xyzw(self._rates.rotations(stamps_ns, values))
@@ -232,8 +232,7 @@ class MessageReader:
     def _pose_fields(self, data: bytes) -> PoseFields:
         """Unpack a pose in CDR.
 
-        To save time, names of frames are decoded only if their bytes differ from those of the
-        previous pose.
+        To save time, frame names are decoded only if their bytes differ from the previous pose.
         """
         start = START + STAMP_SIZE
         if data[start : self._frames.end] != self._frames.data:

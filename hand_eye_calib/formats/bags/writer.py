@@ -19,15 +19,15 @@ Streams = Mapping[str, tuple[Trajectory, str]]
 def write_bag(
     path: str | Path, streams: Streams, storage: str = "mcap"
 ) -> None:
-    """Write trajectories into a new bag; the poses of all topics are sorted by their stamps.
+    """Write trajectories into a new bag. The poses of all topics are sorted by their stamps.
 
     Parameters
     ----------
     path : str or Path
-        Directory of the bag, or for rosbag1 the ``.bag`` file. It must not exist.
+        Directory of the bag; for rosbag1, the ``.bag`` file. It must not exist.
     streams : mapping of str to (Trajectory, str)
-        Trajectory and message type of each topic. The type is Odometry, which contains the sensor's
-        frame, or PoseStamped. The stamps of the trajectory are the header stamps and the bag times.
+        Trajectory and message type of each topic: Odometry, which contains the sensor's frame, or
+        PoseStamped. The stamps of the trajectory are header stamps and bag times.
     storage : {"mcap", "sqlite3", "rosbag1"}
 
     Raises
@@ -84,7 +84,7 @@ def stamped_messages(
 ) -> Iterator[tuple[int, Any]]:
     """Iterate over the stamps (ns) and messages of a trajectory.
 
-    ``types`` are the classes of messages in rosbags, by message type.
+    ``types`` has the classes of messages in rosbags, by message type.
     """
 
     def make(name: str, *values: Any) -> Any:

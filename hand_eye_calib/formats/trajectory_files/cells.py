@@ -1,6 +1,6 @@
 """Cells of the lines of a text file: the separator between cells, and the numbers in cells.
 
-Every pattern matches a whole cell. Its time is proportional to the length of the cell, so that a
+Every pattern matches a whole cell. Its time is in proportion to the length of the cell, so a
 hostile file cannot make it slow.
 """
 
@@ -13,7 +13,7 @@ from hand_eye_calib.formats.trajectory_files.dates import is_date_or_time
 
 #: Separator of a file whose cells are separated by white space.
 BLANKS = ""
-# Possible separators, the preferred one first if several of them fit equally well.
+# Possible separators. If several of them fit equally well, the first one is used.
 _SEPARATORS = (";", "\t", ",", "|", BLANKS)
 _NUMBER = re.compile(
     r"[-+]?(\d+(\.\d*)?|\.\d+)(e[-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE
@@ -42,7 +42,7 @@ _ANGLE = re.compile(
     r"(?P<behind>[NSEW]?)",
     re.ASCII,
 )
-# Largest number of characters of a cell that may be an angle.
+# Largest number of characters in a cell that may be an angle.
 _LONGEST_ANGLE = 40
 # Characters that occur in angles, but not in plain numbers: hemispheres and signs of units.
 _ANGLE_SIGNS = set("NSEW°º'′’\"″”:")
@@ -72,17 +72,17 @@ def is_value(cell: str) -> bool:
 
 
 def is_null(cell: str) -> bool:
-    """Whether a cell is empty, nan or another mark of a missing value."""
+    """Return whether a cell is empty, nan or another mark of a missing value."""
     return cell.lower() in _NULLS
 
 
 def is_angle(cell: str) -> bool:
-    """Whether a cell is an angle in degrees, such as 52.1, 52 12 0.5 or 52d12m N."""
+    """Return whether a cell is an angle in degrees, such as 52.1, 52 12 0.5 or 52d12m N."""
     return _degrees(cell) is not None
 
 
 def _is_marked_angle(cell: str) -> bool:
-    """Whether a cell is an angle that a hemisphere, a degree sign, a quote or a colon marks."""
+    """Return whether a cell has a mark of an angle: hemisphere, degree sign, quote or colon."""
     return not _ANGLE_SIGNS.isdisjoint(cell) and is_angle(cell)
 
 
@@ -105,7 +105,7 @@ def number(cell: str) -> float:
 
 
 def angle(cell: str) -> float:
-    """Return the number in a cell; an angle such as 52 12 0.5 N is converted to degrees.
+    """Return the number in a cell. An angle such as 52 12 0.5 N is converted to degrees.
 
     Raises
     ------
@@ -174,9 +174,9 @@ def _split_at_blanks(line: str) -> list[str]:
 def separator_of(lines: Sequence[str]) -> str:
     """Return the separator of the cells in lines.
 
-    A wrong separator leaves several numbers in one cell, which is then no number. So the separator
-    is used for which the cells that are numbers contain the most digits. If no cell is a number,
-    the first possible separator in the first line is used.
+    A wrong separator leaves several numbers in one cell, which is then not a number. Therefore the
+    separator with most digits in cells that are numbers is used. If no cell is a number, the first
+    possible separator in the first line is used.
     """
     n_digits = {}
     for separator in _SEPARATORS:
@@ -201,11 +201,11 @@ def _digits_in_numbers(cells: Sequence[str]) -> int:
 
 
 def names_in(line: str, separator: str) -> list[list[str]]:
-    """Return the names of columns in a line, once for each way to split the line.
+    """Return the names of columns in a line, for each way to split the line.
 
-    A header may be separated in another way than the rows. So the line is split at the separator
-    of the rows, at this separator outside brackets, at white space outside brackets, at gaps of two
-    or more spaces, and at the other separators, in this order.
+    A header may have another separator than the rows. The line is split in several ways, in this
+    order: at the separator of the rows, at the same separator outside brackets, at white space
+    outside brackets, at gaps of two or more spaces, at the other separators.
     """
     text = line.lstrip("#/%").strip()
     between_gaps = [name.strip() for name in text.split("  ")]
@@ -222,9 +222,9 @@ def names_in(line: str, separator: str) -> list[list[str]]:
 
 
 def _outside_brackets(text: str, separator: str) -> list[str]:
-    """Split a line at a separator, but not at those inside brackets."""
+    """Split a line at a separator outside brackets."""
     cells = [""]
-    # Number of brackets that are open at the letter.
+    # Number of open brackets at the letter.
     depth = 0
     for letter in text:
         if letter in "([{":

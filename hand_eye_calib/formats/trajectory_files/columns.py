@@ -1,7 +1,7 @@
-"""Quantities, units and kind of data of a table, recognised by the names of its columns.
+"""Quantities, units and kind of data of a table, recognised from the names of its columns.
 
-A quantity is what a column contains: "x", "qw", "lat" or "t", for example. Each quantity has a list
-of names that programs use for it. The kind of data is "poses", "positions", "rotations", "rates" or
+A quantity is the content of a column, such as "x", "qw", "lat" or "t". Each quantity has a list of
+names that programs use for it. The kind of data is "poses", "positions", "rotations", "rates" or
 "twists".
 """
 
@@ -25,11 +25,11 @@ TRANSLATION = tuple(f"m{row}4" for row in "123")
 LAST_ROW = tuple(f"m4{column}" for column in "1234")
 RATES = ("wx", "wy", "wz")
 TWIST = ("vx", "vy", "vz", *RATES)
-# Groups of quantities, each of which is a position; the preferred group first.
+# Groups of quantities that are a position. The first group has priority.
 _POSITIONS = (POSITION, ("lat", "lon", "height"), ("x", "y", "height"))
-#: Groups of quantities, each of which is the position of a vehicle on a plane.
+#: Groups of quantities that are the position of a vehicle on a plane.
 PLANAR_POSITIONS = (("x", "y"), ("lat", "lon"))
-# Groups of quantities, each of which is an orientation; the preferred group first.
+# Groups of quantities that are an orientation. The first group has priority.
 _ORIENTATIONS = (
     QUATERNION,
     SCALAR_FIRST,
@@ -44,8 +44,8 @@ _ORIENTATION_QUANTITIES = {
     name for group in (*_ORIENTATIONS, *_PLANAR_ORIENTATIONS) for name in group
 }
 
-# Names of a coordinate of a position. {0} is the axis (x), {1} its number (0), {2} the names that
-# only this axis has (easting).
+# Names of a coordinate of a position. {0} is the axis (x), {1} its number (0), and {2} names of
+# this axis only (easting).
 _POSITION_NAMES = (
     "{0} t{0} t_{0} p{0} p_{0} pos_{0} position_{0} translation_{0} position{1} "
     "actual_tcp_pose_{1} ecef_{0} {0}_ecef {0}_ecf {2}"
@@ -55,15 +55,16 @@ _DIRECTIONS = {
     "y": "northing pos_north",
     "z": "altitude pos_up",
 }
-# Beginnings of the names of angular rates, velocities and quaternions. The name of the axis, or of
-# the coefficient of the quaternion, follows.
+# First parts of the names of angular rates, velocities and quaternions. The axis, or the
+# coefficient of the quaternion, follows.
 _BEGINNINGS = {
     "w": "w w_ omega_ gyro_ gyr_ angvel_ ang_vel_ angular_velocity_ angular_rate_ rate_",
     "v": "v",
     "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-# Names of each quantity, in lower case, with underscores between words. Files exported from bags
-# name a column by a whole path, such as .pose.pose.position.x: its end is compared with the names.
+# Names of each quantity, in lower case, with underscores between words. A file that was exported
+# from a bag has a whole path such as .pose.pose.position.x as the name of a column. The end of the
+# path is compared with the names.
 _NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
@@ -106,8 +107,8 @@ _NAMES = {
     "rotvec_z": "rotvec_z actual_tcp_pose_5 rz",
     **{name: name for name in MATRIX},
 }
-# Names without an underscore that may be the end of a longer name, as in gps_fix_latitude. Other
-# such names ("x", "time") are too common at the end of names of other quantities.
+# Names without an underscore that may be the end of a longer name, such as gps_fix_latitude. Other
+# short names ("x", "time") often are the end of the names of other quantities.
 _ENDS = {
     "latitude",
     "longitude",
@@ -122,8 +123,8 @@ _ENDS = {
 _ELEMENT = re.compile(
     r"(?:^|_)(?:m|r|t|h|rot|mat|matrix|rotation|pose|transform|rotm)_?(\d)_?(\d)$"
 )
-# Parts of names that indicate an orientation in a table, even if no quantity was recognised. The
-# names of all columns are joined by commas.
+# Parts of names that indicate an orientation, even if no quantity was recognised. They are searched
+# for in the names of all columns, joined by commas.
 _ORIENTED = re.compile(
     r"(^|[^a-z])q(\d|uat|,|$)|orient|rot|angle|euler|attitude|"
     r"(^|,)(a,b,c|w,p,r|rx,ry,rz|ex,ey,ez|omega,phi,kappa)(,|$)"
@@ -149,8 +150,8 @@ _UNIT_NAMES = {
 _UNITS = {
     name: unit for unit, names in _UNIT_NAMES.items() for name in names.split()
 }
-# Names of units in brackets. Some of them mean something else at the end of a name: stamp_sec is a
-# quantity, the whole seconds of a stamp.
+# Names of units in brackets. Without brackets, some of them mean something else at the end of a
+# name: stamp_sec has the whole seconds of a stamp.
 _UNITS_IN_BRACKETS = {
     **_UNITS,
     **dict.fromkeys(("sec", "secs"), "s"),
@@ -158,10 +159,10 @@ _UNITS_IN_BRACKETS = {
     # Degrees, minutes and seconds.
     **dict.fromkeys(("d/m/s", "+/-d/m/s", "dms", "d/m"), "deg"),
 }
-# Words in the name of a column whose unit is a unit of time. "tow" and "sow" are the time and the
-# second of a GPS week.
+# Words in the names of columns with a unit of time. "tow" and "sow" are the time and the second of
+# a GPS week.
 _TIME_WORD = re.compile(r"t|time.*|stamp.*|(?:gps|i)?(?:tow|sow)")
-# Brackets with their content; brackets without an end extend to the end of the name.
+# Brackets with their content. A bracket that is not closed extends to the end of the name.
 _BRACKETS = re.compile(r"[\[(]([^\])]*)([\])]|$)")
 
 
@@ -191,7 +192,8 @@ def named_columns(
     for quantity, text in _NAMES.items():
         places = _places_of(text.split(), plain)
         if quantity in ROTATION_VECTOR:
-            # rx, ry and rz in degrees are Euler angles of an unknown order, not a rotation vector.
+            # In degrees, rx, ry and rz are Euler angles of an unknown order instead of a rotation
+            # vector.
             places = [
                 place
                 for place in places
@@ -207,7 +209,7 @@ def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
     """Return the columns whose names are among the aliases of a quantity.
 
     If there are none, return the columns whose names end in an alias, such as pose_position_x for
-    the alias position_x. Aliases of one word are compared with ends only if they are in ``_ENDS``.
+    the alias position_x. An alias of one word must then be in ``_ENDS``.
     """
     places = [place for place, name in enumerate(plain) if name in aliases]
     if places:
@@ -219,7 +221,7 @@ def _places_of(aliases: Sequence[str], plain: Sequence[str]) -> list[int]:
 
 
 def is_brief(name: str) -> bool:
-    """Whether a column has the name rx, ry or rz.
+    """Return whether the name of a column is rx, ry or rz.
 
     Universal Robots uses these names for a rotation vector, other makers for Euler angles.
     """
@@ -229,10 +231,10 @@ def is_brief(name: str) -> bool:
 def _elements(
     plain: Sequence[str], columns: Mapping[str, list[int]]
 ) -> dict[str, list[int]]:
-    """Return the columns of the elements m11 to m34 of a pose; empty without a whole rotation.
+    """Return the columns of the elements m11 to m34 of a pose; empty if the rotation is incomplete.
 
-    The names may count the rows and columns of the matrix from 0 or from 1. The translation may
-    have the names of a position.
+    The names may count rows and columns of the matrix from 0 or from 1. The translation may have
+    the names of a position.
     """
     places_of: dict[tuple[int, int], list[int]] = {}
     for place, name in enumerate(plain):
@@ -259,7 +261,7 @@ def measured(
 ) -> tuple[str, Sequence[str]]:
     """Return the kind of data in a table, and the quantities to read for this kind.
 
-    The quantities may have no columns. Then the caller raises an error that names them.
+    If a quantity has no column, the caller raises an error that names it.
 
     Parameters
     ----------
@@ -282,8 +284,8 @@ def measured(
     if measures == "poses":
         if has_matrix:
             return measures, MATRIX
-        # A pose without a height is accepted only if its orientation is a yaw or a heading alone,
-        # as for a vehicle on a plane.
+        # A pose without a height is accepted only if its orientation is only a yaw or heading, as
+        # for a vehicle on a plane.
         if (
             position in PLANAR_POSITIONS
             and orientation not in _PLANAR_ORIENTATIONS
@@ -303,15 +305,16 @@ def measured(
 def _first_group(
     groups: Iterable[Sequence[str]], columns: Mapping[str, list[int]]
 ) -> Sequence[str]:
-    """Return the first group whose quantities all have columns; empty without such a group."""
+    """Return the first group whose quantities all have columns; empty if there is none."""
     return next((group for group in groups if {*group} <= columns.keys()), ())
 
 
 def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     """Return the kind of data in columns without a matrix.
 
-    Positions alone are "positions" only if no name indicates an orientation, and the same for
-    "rotations". Otherwise the table is "poses", so that an error reports the missing quantities.
+    Positions alone are "positions" only if no name indicates an orientation, and likewise for
+    "rotations". Otherwise the table counts as "poses", so that an error reports the missing
+    quantities.
     """
     listed = ",".join(plain_name(name) for name in names)
     if _first_group((*_POSITIONS, *PLANAR_POSITIONS), columns):
@@ -328,9 +331,9 @@ def _kind_of(columns: Mapping[str, list[int]], names: Sequence[str]) -> str:
     return "poses"
 
 
-# Groups of quantities, each of which is a stamp; the preferred group first. "sow" is the second of
-# a GPS week, "mow" its millisecond. The stamp of a message's header is preferred to the time of its
-# arrival, and a date with a time of day to a GPS week.
+# Groups of quantities that are a stamp. The first group has priority: the stamp of a header before
+# the time of arrival, and a date with a time of day before a GPS week. "sow" is the second of a GPS
+# week, "mow" its millisecond.
 _STAMPS = (
     ("secs", "nsecs"),
     ("header",),
@@ -346,10 +349,10 @@ _STAMPS = (
 
 
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
-    """Return the quantities whose columns together are the stamp; empty without such columns.
+    """Return the quantities that together are the stamp; empty if they have no columns.
 
-    If there are a stamp "t", a GPS week and a second of the week, "t" is used, because it is on
-    the clock of the recording.
+    If there are a stamp "t", a GPS week and a second of this week, "t" is used: it is on the clock
+    of the recording.
     """
     has_second = "sow" in columns or "mow" in columns
     if has_second and {"week", "t"} <= columns.keys():
@@ -358,7 +361,7 @@ def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
 
 
 def is_pose(columns: Iterable[str]) -> bool:
-    """Whether quantities include a position, rates, or a rotation matrix."""
+    """Return whether quantities include a position, rates, or a rotation matrix."""
     groups = (*PLANAR_POSITIONS, RATES, ROTATION)
     return any({*group} <= {*columns} for group in groups)
 
@@ -369,15 +372,15 @@ def plain_name(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit, which may be empty.
+    """Return a column's name without its unit, and its unit, which may be empty.
 
     ``.pose.position.x [mm]`` becomes pose_position_x and mm; wx_deg_s becomes wx and deg/s.
     """
     name = name.strip().lower()
-    # An index, as in q[0] or T[0][3], is not a unit in brackets: write it as q_0_.
+    # An index such as in q[0] or T[0][3] is not a unit in brackets. Write it as q_0_.
     if re.search(r"\[\d\]$", name):
         name = re.sub(r"\[(\d)\]", r"_\1_", name)
-    # Remove names of frames, as in p_RS_R_x of EuRoC and tx_world_device of Aria.
+    # Remove frame names, such as in p_RS_R_x of EuRoC and tx_world_device of Aria.
     name = re.sub(
         r"^([pqw])_[a-z]{2}(_[a-z])?_|_(world|odometry)_device$", r"\1_", name
     )
@@ -393,17 +396,17 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _unit_in_brackets(text: str) -> str:
-    """Return the unit in the brackets of a name: deg/s for "deg s^-1"."""
+    """Return the unit in the brackets of a name, such as deg/s for "deg s^-1"."""
     unit = text.strip().removesuffix("-1").removesuffix("^").strip()
     return _UNITS_IN_BRACKETS.get(re.sub(r"[\s/_]+", "/", unit), "")
 
 
 def _split_words(words: list[str]) -> tuple[str, str]:
-    """Return the joined words of a name without a unit at its end, and this unit.
+    """Return the joined words of a name without the unit at its end, and this unit.
 
-    A unit of time belongs to a name with a word of time, and other units to names without one.
+    A unit of time is accepted after a word of time only, and other units after other words only.
     """
-    # The number of a coefficient or axis, as in q_0 and position_1, belongs to the name.
+    # The number of a coefficient or axis, such as in q_0 and position_1, belongs to the name.
     if (
         len(words) > 1
         and words[-1].isdigit()

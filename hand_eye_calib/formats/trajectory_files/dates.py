@@ -1,4 +1,4 @@
-"""Stamps in text: numbers, weeks of GPS, dates and times of day, without loss of digits.
+"""Stamps in text, read without loss of digits: numbers, weeks of GPS, dates and times of day.
 
 Every pattern is applied to at most :data:`_LONGEST` characters, so that a hostile file cannot make
 it slow.
@@ -48,7 +48,7 @@ _YEAR_FIRST = re.compile(
 _YEAR_LAST = re.compile(
     r"(\d\d?)([-/. ])(\d\d?|[a-z]{3,9})\2(\d{4})", re.IGNORECASE | re.ASCII
 )
-# A date such as 20231114. Its groups have the numbers of those of _YEAR_FIRST.
+# Date such as 20231114. Its groups have the same numbers as those of _YEAR_FIRST.
 _PACKED = re.compile(r"(20\d\d)()(\d\d)(\d\d)", re.ASCII)
 # Text between a date and a time of day.
 _BETWEEN = re.compile(r"T|[ ,_-]{1,4}|", re.IGNORECASE)
@@ -58,7 +58,7 @@ _TIME = re.compile(
     re.IGNORECASE | re.ASCII,
 )
 _ZONE = re.compile(r"([-+])(\d\d):?(\d\d)?", re.ASCII)
-# Number of characters from which a time is a complete stamp, so that no date from another column is
+# A time with at least this number of characters is a complete stamp: no date from another column is
 # put before it.
 _LONGEST_TIME = len("HH:MM:SS.123456789ab")
 
@@ -66,10 +66,10 @@ _LONGEST_TIME = len("HH:MM:SS.123456789ab")
 def seconds_of(text: str) -> Decimal:
     """Return the seconds since 1970 of a date with or without a time of day.
 
-    For a time of day alone, the seconds since midnight are returned. A time without a zone is UTC.
-    The digits after the seconds are decimals (12:30:05.25 has 250 ms). If the separator before the
-    digits is the same as that between minutes and seconds (12:30:05:25), the digits are a whole
-    number: up to 3 digits are milliseconds, up to 6 microseconds, up to 9 nanoseconds (25 ms).
+    A time of day alone yields the seconds since midnight. A time without a zone is UTC. Digits
+    after the seconds are decimals: 12:30:05.25 has 250 ms. If the separators before and after the
+    seconds are equal (12:30:05:25), these digits are a whole number: up to 3 digits are
+    milliseconds, up to 6 microseconds, up to 9 nanoseconds (25 ms).
 
     Raises
     ------
@@ -90,7 +90,7 @@ def seconds_of(text: str) -> Decimal:
 
 
 def is_date_or_time(text: str) -> bool:
-    """Whether the text is a date, a time of day, or both."""
+    """Return whether the text is a date, a time of day, or both."""
     try:
         seconds_of(text)
     except ValueError:
@@ -99,7 +99,7 @@ def is_date_or_time(text: str) -> bool:
 
 
 def is_date(text: str) -> bool:
-    """Whether the text is a date without a time of day."""
+    """Return whether the text is a date without a time of day."""
     try:
         day, rest = _day_and_rest(text.strip()[: _LONGEST + 1])
     except ValueError:
@@ -108,7 +108,7 @@ def is_date(text: str) -> bool:
 
 
 def is_ambiguous(text: str) -> bool:
-    """Whether a date with slashes is another valid date if its day and month are exchanged."""
+    """Return whether a date with slashes remains valid if its day and month are exchanged."""
     match = _YEAR_LAST.match(text.strip()[:_LONGEST])
     if not match or match[2] != "/" or not match[3].isdigit():
         return False
@@ -116,7 +116,7 @@ def is_ambiguous(text: str) -> bool:
 
 
 def _day_and_rest(text: str) -> tuple[int | None, str]:
-    """Return the day since 1970 of a date at the beginning of a text, and the rest of the text.
+    """Return the day since 1970 of a date at the beginning of a text, and the remaining text.
 
     The day is None if the text does not begin with a date.
     """
@@ -127,7 +127,7 @@ def _day_and_rest(text: str) -> tuple[int | None, str]:
         return None, text
     day = match[1]
     month = match[3]
-    # Dates with slashes begin with the month, unless the first number is too large for a month.
+    # Dates with slashes begin with the month, unless the first number is no month.
     if match[2] == "/" and int(match[1]) <= 12:
         day = match[3]
         month = match[1]
@@ -164,7 +164,7 @@ def _time_of_day(text: str) -> Decimal:
         raise ValueError("no time of day")
     fraction = Decimal(0)
     if digits:
-        # After a separator as in 12:30:05:25, the digits are a number of ms, us or ns.
+        # With equal separators, as in 12:30:05:25, the digits are a number of ms, us or ns.
         is_number = point == separator and point != "."
         fraction = _fraction(digits, is_number)
     return (
@@ -174,7 +174,7 @@ def _time_of_day(text: str) -> Decimal:
 
 
 def _hour_of_day(hour: int, half: str | None) -> int:
-    """Return the hour from 0 to 23; ``half`` is "am", "pm", or None for an hour without either."""
+    """Return the hour from 0 to 23. ``half`` is "am", "pm", or None for a 24-hour clock."""
     if half is None:
         return hour
     if not 1 <= hour <= 12:
@@ -183,9 +183,9 @@ def _hour_of_day(hour: int, half: str | None) -> int:
 
 
 def _fraction(digits: str, is_number: bool) -> Decimal:
-    """Return the fraction of a second in digits.
+    """Return the fraction of a second from its digits.
 
-    If the digits are a number, up to 3 of them are ms, up to 6 are us, and up to 9 are ns.
+    If the digits are a whole number, up to 3 of them are ms, up to 6 are us, and up to 9 are ns.
     """
     n_decimals = 3 * math.ceil(len(digits) / 3) if is_number else len(digits)
     return Decimal(digits).scaleb(-n_decimals)
@@ -214,14 +214,14 @@ def stamp_of(
         Quantities of the cells, such as ("date", "t"); see columns.stamp_columns.
     cells : sequence of str
     unit : str, optional
-        Unit of the time within a GPS week, if the name of the column states it. By default, the
-        number is in seconds, or in milliseconds if it is more than the seconds of two weeks.
+        Unit of the time within a GPS week, if a column name states it. The default is seconds, or
+        milliseconds for numbers above the seconds of two weeks.
 
     Returns
     -------
     Decimal
-        In seconds for dates and GPS weeks; in nanoseconds for columns of seconds and nanoseconds;
-        otherwise in the unit of the column.
+        Stamp in seconds for dates and GPS weeks, in nanoseconds for columns of seconds and
+        nanoseconds, and otherwise in the unit of the column.
 
     Raises
     ------
@@ -237,7 +237,7 @@ def stamp_of(
         second = _number(last)
         if second is not None and second.is_finite():
             return _stamp_in_week(cells[0], second, unit)
-    # A longer cell is a complete stamp: ignore the date in the other column.
+    # A longer cell is a complete stamp. Ignore the date in the other column.
     if names[0] == "date" and ":" in last and len(last) < _LONGEST_TIME:
         return seconds_of(" ".join(cells))
     return _decimal(last)
@@ -246,7 +246,7 @@ def stamp_of(
 def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
     """Convert a GPS week and a second of the week to seconds since 1970, in GPS time.
 
-    A number that is too large for a second of two weeks, also in ms, is a complete stamp. It is
+    A number above the seconds, and above the milliseconds, of two weeks is a complete stamp, and
     returned unchanged.
     """
     for possible_unit in (unit,) if unit else ("s", "ms"):
@@ -263,7 +263,7 @@ def _stamp_in_week(week_text: str, second: Decimal, unit: str) -> Decimal:
 
 def _number(text: str) -> Decimal | None:
     """Return the number in a text, with a decimal point or comma; None for other text."""
-    # Decimal ignores underscores, but in stamps they separate numbers.
+    # Decimal ignores underscores, but in stamps an underscore separates two numbers.
     if "_" in text:
         return None
     for number in (text, text.replace(",", ".")):
@@ -275,7 +275,7 @@ def _number(text: str) -> Decimal | None:
 
 
 def decimals(texts: Sequence[str]) -> list[Decimal]:
-    """Return the numbers in texts, as :func:`stamp_of` does for one column.
+    """Return the numbers in texts, as :func:`stamp_of` does for a single column.
 
     Raises
     ------
@@ -293,12 +293,12 @@ def decimals(texts: Sequence[str]) -> list[Decimal]:
 
 
 def _is_stamp(number: Decimal) -> bool:
-    """Whether a number is finite and not too large for a stamp."""
+    """Return whether a number is finite and not too large for a stamp."""
     return number.is_finite() and number.adjusted() <= 30
 
 
 def _decimal(text: str) -> Decimal:
-    """Return the number in a text, in an unknown unit, or the seconds of a date or time of day."""
+    """Return the number in a text (in an unknown unit), or the seconds of a date or time of day."""
     stamp = _number(text)
     if stamp is None and is_date_or_time(text):
         return seconds_of(text)
@@ -308,9 +308,9 @@ def _decimal(text: str) -> Decimal:
 
 
 def notes_on_stamps(names: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """Return notes for the user on the stamps of a table: GPS time, and ambiguous dates.
+    """Return notes for the user about the stamps of a table: GPS time, and ambiguous dates.
 
-    ``names`` are the quantities of the stamp, ``cells`` its cells in one row.
+    ``names`` has the quantities of the stamp, and ``cells`` its cells in one row.
     """
     notes = []
     if names and names[0] == "week":

@@ -1,4 +1,4 @@
-"""Options to read a text file with a trajectory."""
+"""Options for reading a text file with a trajectory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,24 +12,24 @@ from hand_eye_calib.core.base.config import (
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.option import did_you_mean
 
-#: Value of the options ``format`` and ``measures``: recognise them from the content of the file.
+#: Value of the options ``format`` and ``measures`` with which the content of the file decides.
 AUTO = "auto"
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileOptions:
-    """Options to read a text file; see :func:`hand_eye_calib.read_trajectory`.
+    """Options for reading a text file; see :func:`hand_eye_calib.read_trajectory`.
 
     Attributes
     ----------
     pair_by : str
-        How the poses of several files are paired: by "time", or without stamps by "row" or by the
-        "name" of their images. All files of a calibration have the same value.
+        How poses of several files are paired: by "time"; without stamps by "row", or by the "name"
+        of their images. All files of a calibration have the same value.
 
     Raises
     ------
     ConfigError
-        For unknown values, and for options that cannot be combined.
+        If a value is unknown, or options cannot be combined.
     """
 
     format: str = "tum"

@@ -1,8 +1,8 @@
 """Layout of a text file with rows of numbers.
 
 A layout contains the line where the rows begin, the separator of their cells, and the quantity of
-each column (x, qw, ...). The quantities are recognised by the names above the rows. Without names,
-they are recognised by the values (``recognition.py``).
+each column (x, qw, ...). The quantities are recognised by the names above the rows or, without
+names, by the values (``recognition.py``).
 """
 
 import re
@@ -43,8 +43,8 @@ from hand_eye_calib.formats.trajectory_files.recognition import (
     columns_of_rows,
 )
 
-#: Stamps since 1970 are in ns from 10**17, in us from 10**14, in ms from 10**11, and in seconds
-#: below. These are times in March 1973, so the unit of later stamps is clear.
+#: Smallest exponents of 10 for stamps since 1970 in ns, us and ms; smaller stamps are in seconds.
+#: The limits correspond to March 1973, so the unit of later stamps is clear.
 UNIT_EXPONENTS = {"ns": 17, "us": 14, "ms": 11}
 COMMENTS = ("#", "//")
 #: Remedy for commas both between cells and in numbers.
@@ -54,20 +54,20 @@ DECIMAL_COMMAS = (
 )
 _LINE = re.compile(r"\S[^\r\n]*")
 
-# Largest number of lines from which the layout is recognised; comments do not count. Text above the
-# columns has about 20 lines, sometimes 100.
+# The layout is recognised from at most this number of lines, without comments. Text above the
+# columns usually has about 20 lines, sometimes 100.
 _MOST_LINES = 300
-# Largest number of characters from which the layout is recognised.
+# The layout is recognised from at most this number of characters.
 _MOST_CHARACTERS = 1 << 19
-# Largest number of comments, the last ones above the first row, in which column names are searched.
+# Column names are searched for in at most this number of comments, the last ones above the first
+# row.
 _MOST_COMMENTS = 100
-# A line is a row of numbers if at least this share of its cells are values. The other cells may be
-# names of frames.
+# Smallest share of values among the cells of a row of numbers. Other cells may be frame names.
 _MIN_SHARE_OF_VALUES = 0.5
 
 #: Quantities of the columns in the format tum.
 TUM = ("t", *POSITION, "qx", "qy", "qz", "qw")
-# A stamp since 1970 in any unit: seconds have ten digits.
+# Stamp since 1970 in any unit. In seconds it has ten digits.
 _SINCE_1970 = re.compile(r"\d{10,}(\.\d*)?", re.ASCII)
 
 
@@ -78,19 +78,20 @@ class Layout:
     Attributes
     ----------
     rows_after : int
-        Number of the last line above the rows; lines count from 1. 0 if the rows begin at once.
+        Number of the last line above the rows (from 1); 0 if there is no such line.
     cells_of : callable
-        Splits a row into cells.
+        Function that splits a row into cells.
     row : list of str
         Cells of the first row; empty without rows.
     names : tuple of str, optional
         Names of the columns, from a line above the rows.
     format : str
-        Format of the rows. "tum" if no format fits: the error then describes a row of this format.
+        Format of the rows. It is "tum" if no format fits, so that the error describes a row of this
+        format.
     columns : tuple of str, optional
-        Quantities of the columns; None if they are not known.
+        Quantities of the columns; None if unknown.
     is_transposable : bool
-        Whether the elements of a rotation matrix may be in the order of its rows or of its columns.
+        Whether a rotation matrix may be stored by rows or by columns.
     """
 
     rows_after: int
@@ -107,7 +108,7 @@ def lines_of(
 ) -> Iterator[tuple[int, str]]:
     """Yield the number and the text of each line that is not blank.
 
-    With ``after``, comments and the lines up to this line number are skipped.
+    With ``after``, comments and all lines up to this line number are skipped.
 
     Raises
     ------
@@ -139,8 +140,8 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
         Name of the text in messages.
     text : str
     needs_names : bool
-        Whether no option names the columns. A line above the rows with the names of more or fewer
-        columns is then an error.
+        Whether the names of the columns must come from the file. Then a line above the rows with
+        more or fewer names than columns is an error.
 
     Raises
     ------
@@ -174,7 +175,7 @@ def layout_of(path: str | Path, text: str, needs_names: bool) -> Layout:
 def _layout_without_rows(
     lines: Sequence[tuple[int, str]], separator: str
 ) -> Layout:
-    """Return the layout of a text without rows of numbers, whose last line may name the columns."""
+    """Return the layout of a text without rows of numbers. Its last line may name the columns."""
     split = splitter(separator)
     if not lines:
         return Layout(0, split, [], None, "tum", STAMPED_POSE)
@@ -183,7 +184,7 @@ def _layout_without_rows(
 
 
 def _usual_row(rows: Sequence[list[str]]) -> list[str]:
-    """Return the first row that has the most frequent number of cells."""
+    """Return the first row with the most frequent number of cells."""
     n_cells = Counter(map(len, rows)).most_common(1)[0][0]
     return next(row for row in rows if len(row) == n_cells)
 
@@ -191,9 +192,9 @@ def _usual_row(rows: Sequence[list[str]]) -> list[str]:
 def _first_lines(
     path: str | Path, text: str
 ) -> tuple[list[str], list[tuple[int, str]]]:
-    """Return the comments above the first other line, and the first lines that are not comments.
+    """Return the comments before the first other line, and the first lines without comments.
 
-    A line that is not a comment is returned with its number.
+    A line that is not a comment comes with its number.
     """
     comments: deque[str] = deque(maxlen=_MOST_COMMENTS)
     lines: list[tuple[int, str]] = []
@@ -210,20 +211,20 @@ def _first_lines(
 
 
 def _lines_above_rows(cells: Sequence[list[str]]) -> int | None:
-    """Return the number of lines of text above the rows of numbers; None without rows."""
+    """Return the number of lines of text above the rows of numbers; None if there are no rows."""
     rows = [line for line, row in enumerate(cells) if _is_row(row)]
     if not rows:
         return None
     first = cells.index(_usual_row([cells[line] for line in rows]))
-    # Rows with another number of cells may precede the first usual row. They belong to the rows,
-    # so the text ends at the last line before the usual row that is not a row.
+    # Rows with another number of cells may be above the first usual row, and belong to the rows. So
+    # the text ends at the last line above the usual row that is not a row.
     return 1 + max(
         (line for line in range(first) if line not in rows), default=-1
     )
 
 
 def _is_row(cells: Sequence[str]) -> bool:
-    """Whether a line is a row of numbers; at least half of its cells must be values."""
+    """Return whether a line is a row of numbers, in which at least half of the cells are values."""
     filled = [cell for cell in cells if cell]
     n_values = sum(map(is_value, filled))
     has_number = any(
@@ -234,25 +235,25 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 # ---- joining of cells
 
-# Function that joins the cells of a row that belong to one column, such as date and time of day.
+# Function that joins cells of a row that belong to one column, such as date and time of day.
 _Merge = Callable[[Sequence[str]], list[str]]
 
 
 def _merged(split: CellsOf, merge: _Merge) -> CellsOf:
-    """Return a function that splits a line, and joins cells that belong to one column."""
+    """Return a function that splits a line, and then joins cells that belong to one column."""
     return lambda line: merge(split(line))
 
 
 def _without_last(cells: Sequence[str]) -> list[str]:
-    """Return cells without the empty cell that a separator at the end of the line makes."""
+    """Return cells without the empty last cell after a separator at the end of the line."""
     return [*cells] if cells[-1] else [*cells[:-1]]
 
 
 def _joining(widths: Sequence[int]) -> _Merge:
     """Return a function that joins neighbouring cells of a row into columns.
 
-    ``widths`` is the number of cells of each column; columns with 0 cells are skipped. The function
-    returns rows with another total number of cells unchanged.
+    ``widths`` has the number of cells of each column; columns with 0 cells are left out. A row with
+    another total number of cells is returned unchanged.
     """
     ends = [0, *accumulate(filter(None, widths))]
 
@@ -265,7 +266,7 @@ def _joining(widths: Sequence[int]) -> _Merge:
 
 
 def _is_split_stamp(cells: Sequence[str]) -> bool:
-    """Whether the first two cells are a date and a time of day."""
+    """Return whether the first two cells are a date and a time of day."""
     return (
         len(cells) > 1
         and is_date(cells[0])
@@ -278,9 +279,9 @@ def _is_split_stamp(cells: Sequence[str]) -> bool:
 
 
 class _Header(NamedTuple):
-    """Names of the columns, if there are any, and a function that joins cells of a row.
+    """Names of the columns, if there are any, and a function that joins the cells of a row.
 
-    It joins cells that belong to one column, such as a date and a time.
+    The function joins cells that belong to one column, such as a date and a time.
     """
 
     names: tuple[str, ...] | None
@@ -292,7 +293,7 @@ def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
     header = _header_above(above, row, separator)
     if header:
         return header
-    # The rows may end with a separator, but the line of the names may not.
+    # The rows may end with a separator that the line of the names lacks.
     if not row[-1]:
         header = _header_above(above, row[:-1], separator)
         return _Header(header.names if header else None, _without_last)
@@ -304,10 +305,10 @@ def _header_of(above: Sequence[str], row: list[str], separator: str) -> _Header:
 def _header_above(
     above: Sequence[str], row: Sequence[str], separator: str
 ) -> _Header | None:
-    """Return the header from the lines above the rows; None if no line fits the row.
+    """Return the header from the lines above the rows, or None if no line fits the row.
 
-    The nearest line with names of quantities is preferred. Without such a line, the nearest line
-    that fits and is not a comment is used.
+    The nearest line with names of quantities is used. If there is none, the nearest fitting line
+    that is not a comment is used.
     """
     unknown = None
     below = ""
@@ -332,7 +333,7 @@ def _refuse_other_number_of_names(
     row: Sequence[str],
     separator: str,
 ) -> None:
-    """Raise an InputError if a line above the rows names more or fewer columns than a row has."""
+    """Raise an InputError if a line above the rows has more or fewer names than a row has cells."""
     for line_number, line in lines:
         names = names_in(line, separator)[0]
         if _are_names_of_quantities(names) and len(row) > 1:
@@ -348,7 +349,7 @@ def _refuse_other_number_of_names(
 
 
 def _are_names_of_quantities(names: Sequence[str]) -> bool:
-    """Whether the names include those of a position, an orientation, rates or a pose."""
+    """Return whether the names include those of a position, orientation, rates or pose."""
     by_name, _ = named_columns(names)
     columns = by_name.keys()
     return (
@@ -361,12 +362,12 @@ def _are_names_of_quantities(names: Sequence[str]) -> bool:
 def _header_if_fitting(
     names: Sequence[str], row: Sequence[str], is_comment: bool
 ) -> _Header | None:
-    """Return a header with one name for each cell of a row; None if the numbers of both differ.
+    """Return a header with a name for each cell of a row, or None if the numbers differ.
 
-    Cells that belong to one quantity are joined. If a comment has more words than the row has
-    cells, the last words are the names: the first words may be text such as "format:".
+    Cells of one quantity are joined. If a comment has more words than the row has cells, only the
+    last words are names: the first words may be text such as "format:".
     """
-    # A separator at the end of the line makes an empty name.
+    # A separator at the end of the line adds an empty name.
     if len(names) == len(row) + 1 and not names[-1]:
         names = names[:-1]
     if not names:
@@ -377,7 +378,7 @@ def _header_if_fitting(
             return _header_of_widths(names, widths, row)
     n_missing = len(row) - len(names)
     if _may_name_several_columns(names[-1]):
-        # The last name stands for all further columns, which get empty names.
+        # The last name stands for all further columns, whose names are empty.
         if len(names) > 1 and n_missing >= -1:
             return _Header((*names[:-1], *[""] * (n_missing + 1)))
     elif is_comment and n_missing < 0:
@@ -388,7 +389,7 @@ def _header_if_fitting(
 def _header_of_widths(
     names: Sequence[str], widths: Sequence[int], row: Sequence[str]
 ) -> _Header:
-    """Return the header of names that have ``widths`` cells in a row; names without cells go."""
+    """Return the header for names with ``widths`` cells each; names without cells are left out."""
     names = [name for name, width in zip(names, widths, strict=True) if width]
     if max(widths) == 1:
         return _Header(_with_degrees(names, row))
@@ -397,18 +398,18 @@ def _header_of_widths(
 
 
 def _may_name_several_columns(name: str) -> bool:
-    """Whether a name such as "cov" or "*" may stand for any number of columns, also for none."""
+    """Return whether a name such as "cov" or "*" may stand for any number of columns, or none."""
     return name.startswith("*") or name.endswith("...") or "cov" in name.lower()
 
 
-# Possible numbers of cells of a latitude or longitude, in the order in which they are tried:
-# degrees; degrees, minutes and seconds; degrees and minutes.
+# Possible numbers of cells of a latitude or longitude, in the order of the trials: degrees;
+# degrees, minutes and seconds; degrees and minutes.
 _ANGLE_CELLS = (1, 3, 2)
 _HEMISPHERES = {"N", "S", "E", "W"}
 
 
 def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
-    """Return the first column of each quantity; quantities without a column are skipped."""
+    """Return the first column of each quantity. Quantities without a column are left out."""
     columns = named_columns(names)[0]
     return {
         columns[quantity][0] for quantity in quantities if quantity in columns
@@ -418,11 +419,11 @@ def _places_of(names: Sequence[str], *quantities: str) -> set[int]:
 def _widths(
     names: Sequence[str], row: Sequence[str], n_angle_cells: int
 ) -> list[int]:
-    """Return the number of cells in a row that belong to each name.
+    """Return the number of cells in a row for each name.
 
-    A latitude or longitude has ``n_angle_cells`` cells, and one more for a hemisphere; a stamp may
-    have two cells, its date and its time of day. If there are as many names as cells, a name whose
-    cell belongs to the quantity before has no cells.
+    A latitude or longitude has ``n_angle_cells`` cells, and one more for a hemisphere. A stamp may
+    have two cells, for date and time of day. If there are as many names as cells, a name whose cell
+    belongs to the previous quantity has no cells.
     """
     angles = _places_of(names, "lat", "lon")
     stamps = _places_of(names, "t", "date")
@@ -457,7 +458,7 @@ def _with_degrees(names: Sequence[str], row: Sequence[str]) -> tuple[str, ...]:
 def _with_units(
     names: tuple[str, ...], below: str, separator: str
 ) -> tuple[str, ...]:
-    """Append the units in the line below the names, if this line has one unit for each name."""
+    """Append the units from the line below the names, if it has one unit for each name."""
     for units in names_in(below, separator) if below else []:
         if len(units) == len(names) and not _is_row(units):
             return tuple(map(" ".join, zip(names, units, strict=True)))
@@ -465,7 +466,7 @@ def _with_units(
 
 
 def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
-    """Rename a first column with an unknown name to "t" if it contains stamps since 1970."""
+    """Rename a first column with an unknown name to "t" if it has stamps since 1970."""
     columns = named_columns(names)[0].keys()
     has_stamp = not columns.isdisjoint(
         {"t", "secs", *named_columns(names[:1])[0]}
@@ -480,7 +481,7 @@ def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
 def _with_named_columns(
     layout: Layout, names: tuple[str, ...], is_separated: bool
 ) -> Layout:
-    """Set the format and the columns of a layout by the names above the rows."""
+    """Set format and columns of a layout from the names above the rows."""
     if (
         not is_separated
         and " ".join(names[1:]).lower() == TUM_COLUMNS.partition(" ")[2]
@@ -491,15 +492,15 @@ def _with_named_columns(
 
 # ---- numbers without names
 
-# Numbers of columns for which several kinds of data are possible. 4: a position with a stamp, or a
-# quaternion. 7: a pose without a stamp, or a stamp with a position and three angles.
+# Numbers of columns that several kinds of data have. 4: a position with a stamp, or a quaternion.
+# 7: a pose without a stamp, or a stamp with a position and three angles.
 _AMBIGUOUS_COUNTS = (4, 7)
 
 
 def _with_fitting_columns(
     layout: Layout, rows: Sequence[Sequence[str]], is_separated: bool
 ) -> Layout:
-    """Set the format and the columns of a layout without names from the values in its rows."""
+    """Set format and columns of a layout without names from the values in its rows."""
     n_columns = len(layout.row)
     columns = columns_of_rows(layout.row, rows)
     may_be_stamped_pose = columns is None or columns[: len(TUM)] == STAMPED_POSE
@@ -522,9 +523,9 @@ def _with_fitting_columns(
 
 
 def _with_assumed_format(layout: Layout, is_separated: bool) -> Layout:
-    """Set the format by the number of columns, because the values in the rows fit no pose.
+    """Set the format by the number of columns, because the values fit no pose.
 
-    Reading the rows then fails with an error that describes a row of this format.
+    Reading the rows then fails. The error describes a row of this format.
     """
     n_columns = len(layout.row)
     if is_separated or n_columns in _AMBIGUOUS_COUNTS:
@@ -536,5 +537,5 @@ def _with_assumed_format(layout: Layout, is_separated: bool) -> Layout:
 
 
 def _is_in_ns(cell: str) -> bool:
-    """Whether a cell is a number of nanoseconds since 1970."""
+    """Return whether a cell is a number of nanoseconds since 1970."""
     return cell.isdecimal() and len(cell) >= UNIT_EXPONENTS["ns"]

@@ -1,10 +1,10 @@
 """Poses from the numbers of a table.
 
-A file may not state the order of its quaternions or the convention of its angles. Both are then
-inferred from the motion: a vehicle moves in a steady direction of its own body, usually forward. If
-its orientations are read in a wrong convention, this direction changes as the vehicle turns.
-Hand-held sensors and drones move in all directions, so their motion does not distinguish
-conventions; the usual convention is then assumed.
+A file may not state the order of its quaternions, or the convention of its angles. Both are then
+inferred from the motion: a vehicle moves in a constant direction of its own body, usually forward.
+With orientations in a wrong convention, this direction changes when the vehicle turns. Hand-held
+sensors and drones move in all directions, so that their motion does not distinguish conventions.
+The usual convention is then assumed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,28 +40,29 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.table import Table
 
-# Largest angle (rad) of a column without a unit: one turn, with room for rounding.
+# Largest angle (rad) in a column without a unit: one turn, with space for rounding.
 _LARGEST_ANGLE_RAD = 2 * np.pi + 0.01
-# For each kind of quantity: units with their factors to m, rad and rad/s, and a limit in the first
-# unit. A column without a unit is in the first unit, or in the second if a value exceeds the limit.
-# The limit of rates is 2,000 deg/s in rad/s, the range of usual gyroscopes.
+# Units of each kind of quantity, with their factors to m, rad and rad/s, and a limit in the first
+# unit. A column without a unit is in the first unit, or in the second unit if a value exceeds the
+# limit. The limit of rates is 2,000 deg/s (in rad/s), the range of usual gyroscopes.
 _KINDS = {
     "length": ({"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}, np.inf),
     "angle": ({"rad": 1.0, "deg": np.pi / 180}, _LARGEST_ANGLE_RAD),
     "rate": ({"rad/s": 1.0, "deg/s": np.pi / 180}, 35.0),
 }
 
-# Conventions of roll, pitch and an angle about the vertical. Notes describe this angle so.
+# Texts that notes use for the conventions of the angles. Here: angle about the vertical.
 _COMPASS = "clockwise from north"
 _MATHEMATICAL = "counterclockwise from x (east)"
-# The angles are those of the inverse rotation, as in the library pyboreas.
+# The angles are those of the inverse rotation, like in the library pyboreas.
 _INVERSE = "that of the world in the sensor's frame"
 # The rotations about x, y and z are applied in the opposite order.
 _OTHER_ORDER = (
     "counterclockwise from x, about the axis that roll and pitch have turned"
 )
-# A sensor remains level if the scatter of the vertical direction in its axes, 1 minus the length of
-# the mean direction, is at most this value: about 1 minus the cosine of 2.5 deg.
+# A sensor remains level if the scatter of the vertical direction in its axes is at most this. The
+# scatter is 1 minus the length of the mean direction. The limit is about 1 minus the cosine of
+# 2.5 deg.
 _LEVEL = 1e-3
 
 # ---- poses and rates
@@ -70,7 +71,7 @@ _LEVEL = 1e-3
 def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     """Return the poses of a table, or its angular rates.
 
-    Notes about conventions that were guessed are added to the table's ``guesses``.
+    Notes about guessed conventions are added to the table's ``guesses``.
 
     Parameters
     ----------
@@ -81,14 +82,14 @@ def poses_of(table: Table, convention: str = "") -> tuple[FloatArray, ...]:
     Returns
     -------
     positions : (N, 3) array
-        Positions, m. For angular rates, the tuple has only one array (N, 3), rad/s.
+        Positions, m. For angular rates, the only array of the result is (N, 3), in rad/s.
     quats_xyzw : (N, 4) array
         Orientations of the sensor in its world.
 
     Raises
     ------
     InputError
-        For invalid values; the message contains their line number.
+        For invalid values; the message contains the line number.
     """
     table.refuse(
         np.asarray(~np.isfinite(table.values()).all(axis=1)),
@@ -120,7 +121,7 @@ def _rotations_of(quats_xyzw: FloatArray) -> FloatArray:
 def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
     """Return the positions (N, 3), m, of a table without matrices.
 
-    For latitudes and longitudes, the second value is the rotations (N, 3, 3) from the axes east,
+    For latitudes and longitudes, the second value has the rotations (N, 3, 3) from the axes east,
     north and up at each position to those at the first position. Otherwise it is None.
     """
     positions = np.zeros((len(table.line_numbers), 3))
@@ -146,9 +147,9 @@ def _refuse_far(table: Table, positions: FloatArray) -> None:
 
 
 def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
-    """Return the positions (N, 3), m, and quaternions (N, 4), scalar last, of matrices.
+    """Return the positions (N, 3), m, and the quaternions (N, 4), scalar last, of matrices.
 
-    The numbers may be rounded to few digits, so the nearest rotation of each matrix is used.
+    The numbers may be rounded, so the nearest rotation of each matrix is used.
     """
     matrices = table.values(MATRIX).reshape(-1, 3, 4)
     positions = matrices[:, :, 3]
@@ -188,10 +189,10 @@ def _in_axes_of_earth(
 ) -> FloatArray:
     """Return the orientations (N, 4) in the earth's axes (ECEF), for positions (N, 3) in ECEF, m.
 
-    The orientations ``quats_xyzw`` (N, 4) of the file may be relative to the earth's axes, or to
-    the axes east, north and up (ENU) or north, east and down (NED) at each position. The convention
+    The orientations ``quats_xyzw`` (N, 4) of the file may be relative to the earth's axes, to the
+    axes east, north and up (ENU), or to north, east and down (NED) at each position. The convention
     is inferred from the motion. Among conventions that fit the motion, those in which the vehicle
-    remains level are preferred.
+    remains level have priority.
     """
     # Rotations (N, 3, 3) from the axes east, north and up at each position to those of the earth.
     axes = axes_of_places(positions)
@@ -238,7 +239,7 @@ def _scatter_in_sensor(quats_xyzw: FloatArray, up: FloatArray) -> float:
 def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
     """Return positions (N, 3), m, along the axes east, north and up at the first position.
 
-    ``up`` is the column of heights, or empty. The second value is the rotations (N, 3, 3) from the
+    ``up`` is the column of heights, or empty. The second value has the rotations (N, 3, 3) from the
     axes east, north and up at each position to those at the first position.
     """
     lat_rad, lon_rad = _in_si(table, ("lat", "lon"), "angle").T
@@ -263,8 +264,8 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
 def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
     """Return k columns (N, k), converted to m, rad or rad/s.
 
-    ``kind`` is "length", "angle" or "rate". If the names of the columns state no unit, it is
-    inferred from the magnitude of the values.
+    ``kind`` is "length", "angle" or "rate". If the column names have no unit, it is inferred from
+    the size of the values.
     """
     factors, largest_of_first = _KINDS[kind]
     values = table.values(names)
@@ -287,7 +288,7 @@ def _in_si(table: Table, names: Sequence[str], kind: str) -> FloatArray:
         if unit == "rad":
             _refuse_degrees(table, names, values)
         return values * factors[unit]
-    # The first two units are those of columns without a unit.
+    # A column without a unit has the first or the second unit.
     first, second, *_ = factors
     largest = float(magnitudes.max())
     unit, other = (
@@ -307,8 +308,8 @@ def _refuse_degrees(
 ) -> None:
     """Raise an InputError if columns that are named as radians probably contain degrees.
 
-    Angles of more than one turn are degrees, except for a yaw or heading, which may count turns
-    without a jump. A jump of more than one turn is in degrees. Without a jump, a note is added.
+    Angles above one turn are degrees. Exception: a yaw or heading may count turns without a jump,
+    and gets a note. A yaw or heading with a jump of more than one turn is in degrees.
 
     Parameters
     ----------
@@ -343,7 +344,7 @@ def _refuse_degrees(
 def _orientations(
     table: Table, positions: FloatArray, convention: str
 ) -> FloatArray:
-    """Return quaternions (N, 4), scalar last; the identity if the table has no orientations."""
+    """Return the quaternions (N, 4), scalar last, of a table; identities without orientations."""
     for names in (QUATERNION, SCALAR_FIRST, UNNAMED):
         if names[0] in table.at:
             return _of_quaternions(table, names, positions)
@@ -362,14 +363,13 @@ def _of_quaternions(
 ) -> FloatArray:
     """Return the quaternions (N, 4) of a table, with the scalar last.
 
-    The names q0 to q3 usually mean the scalar first, and columns without names the scalar last.
-    These orders are assumed, unless the motion or the first orientation is evidence for the
-    opposite order.
+    With names q0 to q3 the scalar is usually first; without names it is usually last. These orders
+    are assumed, unless the motion or the first orientation is evidence for the other order.
     """
     quats = _unit_quaternions(table, names)
     if names == QUATERNION:
         return quats
-    # Quaternions with the scalar last, if the file has the scalar last or first.
+    # Quaternions with the scalar last, if the scalar of the file is last or first.
     candidates = {"last": quats, "first": np.roll(quats, -1, axis=1)}
     usual, opposite = (
         ("first", "last") if names == SCALAR_FIRST else ("last", "first")
@@ -380,7 +380,7 @@ def _of_quaternions(
         order: np.isclose(abs(quats_xyzw[0, 3]), 1.0, rtol=0.0)
         for order, quats_xyzw in candidates.items()
     }
-    # Evidence for the opposite order.
+    # Evidence for the other order.
     reason = ""
     if fitting == [opposite]:
         reason = "the motion then has a steady direction"
@@ -403,9 +403,9 @@ def _of_quaternions(
 
 
 def _unit_quaternions(table: Table, names: Sequence[str]) -> FloatArray:
-    """Return the quaternions (N, 4) in columns; raise an InputError if a length is not 1."""
+    """Return the quaternions (N, 4) in columns. Raise an InputError if a length is not 1."""
     quats = table.values(names)
-    # Squares of very large numbers overflow to infinity, which is rejected.
+    # Squares of very large numbers overflow to infinity, and are rejected.
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(quats, axis=1)
     table.refuse(
@@ -419,9 +419,9 @@ def _unit_quaternions(table: Table, names: Sequence[str]) -> FloatArray:
 
 
 def _require_rotation_vectors(table: Table) -> None:
-    """Raise an InputError if columns rx, ry, rz cannot be a rotation vector in rad.
+    """Raise an InputError if the columns rx, ry, rz cannot be a rotation vector in rad.
 
-    They are then Euler angles in degrees, whose order is unknown.
+    They are then Euler angles in degrees of an unknown order.
     """
     if not is_brief(table.names[table.at[ROTATION_VECTOR[0]]]):
         return
@@ -440,12 +440,12 @@ def _require_rotation_vectors(table: Table) -> None:
 def _of_angles(
     table: Table, positions: FloatArray, convention: str
 ) -> FloatArray:
-    """Return quaternions (N, 4), scalar last, of roll, pitch and yaw or heading.
+    """Return quaternions (N, 4), scalar last, from roll, pitch and yaw or heading.
 
-    Angles are about the fixed axes x, y and z. The axes of the body are x forward, y left and z up,
-    in a world with z up. If the file has a heading, a positive pitch is nose up, as on aircraft and
-    in INS. If it has a yaw, the pitch is about y, as in REP 103. ``convention`` is used instead of
-    the convention inferred from the motion, unless it is empty.
+    Angles are about the fixed axes x, y and z. The body axes are x forward, y left and z up, in a
+    world with z up. With a heading, a positive pitch is nose up, as on aircraft and in INS. With a
+    yaw, the pitch is about y, as in REP 103. ``convention`` replaces the convention that the motion
+    indicates, unless it is empty.
     """
     names = [
         name for name in ("roll", "pitch", "yaw", "heading") if name in table.at
@@ -463,8 +463,8 @@ def _of_angles(
         _OTHER_ORDER: se3.to_quat_xyzw(se3.in_other_order(usual)),
     }
     expected = _COMPASS if names[-1] == "heading" else _MATHEMATICAL
-    # The expected convention comes first. The other order comes last: without roll and pitch it
-    # makes no difference, so on flat ground it fits every motion.
+    # The expected convention is first. The other order is last: without roll and pitch it makes no
+    # difference, so on flat ground it fits every motion.
     preference = {expected: 0, _OTHER_ORDER: 2}
     table.conventions = sorted(
         _conventions_that_fit(positions, candidates),
@@ -491,10 +491,10 @@ def _of_angles(
 def _conventions_that_fit(
     positions: FloatArray, candidates: Mapping[str, FloatArray]
 ) -> list[str]:
-    """Return the conventions that the direction of travel in the sensor's axes does not exclude.
+    """Return the conventions under which the direction of travel may be constant in the sensor.
 
-    A convention is excluded if its scatter of the direction exceeds STEADY_SCATTER, and also
-    exceeds the smallest scatter of all conventions by the factor WRONG_SCATTER_RATIO.
+    A convention is excluded if the scatter of its direction exceeds both STEADY_SCATTER and
+    WRONG_SCATTER_RATIO times the smallest scatter of all conventions.
 
     Parameters
     ----------

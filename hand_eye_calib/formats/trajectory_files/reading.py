@@ -1,7 +1,7 @@
-"""Reading of trajectories from files, bags and numbers in memory.
+"""Read trajectories from files, bags, and numbers in memory.
 
-Files have the format TUM, KITTI or EuRoC, are tables with named columns, or come from programs with
-formats of their own (``extras/sensors/foreign.py``).
+Files have the format TUM, KITTI or EuRoC, are tables with named columns, or have formats of other
+programs (``extras/sensors/foreign.py``).
 """
 
 import shlex
@@ -55,7 +55,7 @@ class FileReading(NamedTuple):
     repairs : list of str
         Notes about faults of the file that were repaired.
     guesses : list of str
-        Notes about properties that the file does not state and that were therefore guessed.
+        Notes about guessed properties, which the file does not state.
     warnings : list of str
         Warnings about the data, to be added to those of the calibration result.
     """
@@ -101,11 +101,11 @@ def read_trajectory(
         "s", "ms", "us" or "ns". By default, the unit is that of the header (``timestamp [ns]``).
         Without it, the unit is inferred from the magnitude of the stamps.
     repair : bool
-        Sort poses that are not in order of time, and drop poses with a repeated stamp; a
+        Sort poses that are not in order of time, and drop poses with a repeated stamp. A
         ``UserWarning`` states their number. By default, such poses are an error.
     measures : str
-        Kind of data to read: "poses", "positions", "rotations" or (angular) "rates"; "auto" for
-        the kind that the columns of a file or the messages of a bag have.
+        Kind of data to read: "poses", "positions", "rotations" or (angular) "rates". "auto" stands
+        for the kind that a file's columns or a bag's messages have.
 
     Returns
     -------
@@ -171,9 +171,9 @@ def read_trajectory(
 def _refuse_misplaced_options(
     path: Path | None, has_file_options: bool, has_times_in_memory: bool
 ) -> None:
-    """Raise a ConfigError for a folder, and for options of the other kind of source.
+    """Raise a ConfigError for a folder, and for options that belong to another kind of source.
 
-    ``path`` is the text file to read, or None for an object.
+    ``path`` is the text file, or None for an object.
     """
     if path and (path.is_dir() or has_suffix_of_bag(path)):
         refuse_saved_result(path)
@@ -192,7 +192,7 @@ def _refuse_misplaced_options(
 def _warn_of(reading: FileReading) -> None:
     """Emit the notes of a reading as warnings.
 
-    Python reports the line that called the function from which this function is called.
+    Python then reports the line that called the public function.
     """
     for text in (*reading.guesses, *reading.repairs, *reading.warnings):
         warnings.warn(text, UserWarning, stacklevel=3)
@@ -201,7 +201,7 @@ def _warn_of(reading: FileReading) -> None:
 def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
     """Return the trajectory of a topic, or of two frames ``world:sensor``, in a bag.
 
-    Notes on the data become warnings, for which Python reports the line of the caller's caller.
+    Notes about the data become warnings, for which Python reports the line of the caller's caller.
     """
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.formats.bags.sources import source_of
@@ -216,10 +216,9 @@ def _of_bag(path: Path, topic: str, measures: str) -> Trajectory:
 def read_trajectory_files(
     files: Sequence[tuple[Path, FileOptions]],
 ) -> list[FileReading]:
-    """Read the text files of one calibration; a sensor without a name gets that of its file.
+    """Read the text files of a calibration. Sensors without a name get the name of their file.
 
-    Files with the same columns come from the same program, so their angles have the same
-    convention.
+    Files with the same columns come from the same program, so their angles have one convention.
 
     Parameters
     ----------
@@ -228,7 +227,7 @@ def read_trajectory_files(
     Raises
     ------
     InputError
-        If a file cannot be read, or no convention fits the motion of all files with the same
+        If a file cannot be read, or if no convention fits the motion of all files with the same
         columns.
     """
     tables = [read_table(path, options) for path, options in files]
@@ -244,7 +243,7 @@ def read_trajectory_files(
     ]
     for number, convention in _corrected_conventions(tables).items():
         path, options = files[number]
-        # Read the table again, because its notes report the convention that it was read with.
+        # Read the table again, because its notes state the convention of its angles.
         table = read_table(path, options)
         readings[number] = _read(
             table, options, rows_of_tables[number], convention
@@ -262,10 +261,10 @@ def read_trajectory_files(
 
 
 def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
-    """Return the convention of angles with which tables must be read again, by table number.
+    """Return the conventions of angles with which tables must be read again, by table number.
 
-    Tables with the same columns must have the same convention. If they were read with different
-    ones, the first that fits the motion of all these tables is used.
+    Tables with the same columns must have one convention. If their conventions differ, the first
+    one that fits the motion of all these tables is used.
 
     Raises
     ------
@@ -301,8 +300,8 @@ def _corrected_conventions(tables: Sequence[Table]) -> dict[int, str]:
 def _sensor_names(paths: Sequence[Path]) -> list[str]:
     """Return a name for the sensor of each file.
 
-    The name is that of the file without suffix. If files have the same name, folders are added to
-    distinguish them. All names are empty if two paths are the same, or differ only in the suffix.
+    The name is the file name without suffix. If files have the same name, folders are added to it.
+    All names are empty if two paths differ only in the suffix, or not at all.
     """
     names = [path.stem for path in paths]
     if len({*names}) < len(names):
@@ -311,9 +310,9 @@ def _sensor_names(paths: Sequence[Path]) -> list[str]:
 
 
 def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
-    """Read the trajectories of one calibration, in formats that are recognised.
+    """Read the trajectories of a calibration, whose formats are recognised.
 
-    Warnings report guesses and repairs, as in :func:`read_trajectory`.
+    Guesses and repairs are reported as warnings, as in :func:`read_trajectory`.
     """
     paths = [
         local_path(fspath(source))
@@ -333,10 +332,10 @@ def read_trajectories(*sources: TrajectoryLike) -> list[Trajectory]:
 def _rows_without_stamps(
     tables: Sequence[Table], pair_by: str
 ) -> list[IntArray]:
-    """Pair the poses of several tables by their row, or by the name of their image.
+    """Pair the poses of several tables by row, or by the name of their image.
 
-    For each table, the indices (N,) of its poses are returned; the poses at index i of all tables
-    are a pair. A row or name without a pose in one of the tables is skipped in all tables.
+    The result has the indices (N,) of poses in each table. Poses at the same place in all results
+    are a pair. A row or name without a pose in one table is skipped in all tables.
     """
     n_rows = [table.n_rows for table in tables]
     if pair_by == "row" and len({*n_rows}) > 1:
@@ -349,7 +348,7 @@ def _rows_without_stamps(
             "each stop into both, or calibrate streams with stamps by time: hand_eye_calib "
             f"calibrate {paths}"
         )
-    # Index of the pose with each name, or from each row of the file.
+    # For each table, the index of the pose with each name, or in each row of the file.
     indices: list[dict[Any, int]] = []
     for table in tables:
         keys: Sequence[Any] = table.images if pair_by == "name" else table.rows
@@ -379,10 +378,10 @@ def _read(
     table : Table
     options : FileOptions
     rows : (N,) array of int, optional
-        Indices of the poses to use, if poses are paired without stamps. These poses get regular
-        stamps. By default, all poses are used with the stamps of the table.
+        Indices of the used poses, if poses are paired without stamps. These poses get regular
+        stamps. By default, all poses are used, with the stamps of the table.
     convention : str, optional
-        Convention of the table's angles. By default, the motion decides.
+        Convention of the table's angles; by default, it is inferred from the motion.
     """
     if not table.line_numbers:
         raise InputError(
@@ -419,7 +418,7 @@ def _read(
 
 
 def _why_no_poses(table: Table) -> str:
-    """Return the end of the message for a table without poses: no rows, or only unusable rows."""
+    """Return the end of the message about a table without poses: no rows, or no usable rows."""
     if not table.n_rows:
         return f"; expected lines of {table.expected}"
     return (
@@ -429,9 +428,9 @@ def _why_no_poses(table: Table) -> str:
 
 
 def _notes_on_skipped_rows(table: Table) -> tuple[list[str], list[str]]:
-    """Return notes on skipped rows without a pose: a list of repairs and a list of warnings.
+    """Return notes about skipped rows without a pose: a list of repairs and a list of warnings.
 
-    Skipping a few rows is a repair. If many were skipped, the note is a warning instead.
+    A few skipped rows are a repair. Many skipped rows are a warning.
     """
     if not table.n_left_out:
         return [], []

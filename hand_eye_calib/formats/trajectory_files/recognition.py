@@ -1,4 +1,4 @@
-"""Quantities of columns without names, recognised by their values.
+"""Quantities of columns without names, recognised from their values.
 
 A quaternion has unit length, and a rotation matrix is orthogonal.
 """
@@ -28,15 +28,15 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     UNNAMED,
 )
 
-# Largest number of rows from whose values the quantities of the columns are recognised.
+# Largest number of rows whose values are used to recognise the columns.
 _MOST_ROWS = 100
-#: Columns of a stamp and a pose whose quaternion may have its scalar first or last.
+#: Columns of a stamp and a pose. The scalar of the quaternion may be first or last.
 STAMPED_POSE = ("t", *POSITION, *UNNAMED)
 # Columns of the state that FAST-LIO and related programs write: a stamp, a rotation vector, a
 # position, and six more vectors (18 columns). The last vector is gravity.
 _FAST_LIO = ("t", *ROTATION_VECTOR, *POSITION, *[""] * 18)
-# Smallest and largest norm of gravity (m/s^2) in the state of FAST-LIO: 9.81, with room for errors
-# of its estimate.
+# Smallest and largest length of gravity (m/s^2) in the state of FAST-LIO: 9.81, with space for
+# errors of its estimate.
 _GRAVITY_M_S2 = (9.6, 10.0)
 # Possible columns of a pose without a stamp, in the order in which they are tried.
 _POSES: tuple[tuple[str, ...], ...] = (
@@ -48,8 +48,8 @@ _POSES: tuple[tuple[str, ...], ...] = (
     (*POSITION, *UNNAMED),
     (*UNNAMED, *POSITION),
 )
-#: Poses whose rotation matrix is separate from the translation. Programs write the elements of such
-#: a matrix in the order of its rows or of its columns.
+#: Poses whose rotation matrix is separate from the translation. Programs store such a matrix by
+#: rows or by columns.
 TRANSPOSABLE = _POSES[3:5]
 # Possible numbers of columns of a covariance (6, 6) after a pose: the diagonal, one triangle, or
 # all elements.
@@ -59,9 +59,9 @@ _COVARIANCES = (6, 21, 36)
 def columns_of_rows(
     row: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> tuple[str, ...] | None:
-    """Return the quantities of the columns from the values in the first rows; None if none fit.
+    """Return the quantities of the columns from values in the first rows, or None if none fit.
 
-    Columns that contain text have an empty name. ``row`` is a row with the usual number of cells.
+    Columns with text have an empty name. ``row`` is a row with the usual number of cells.
     """
     places = [place for place, cell in enumerate(row) if is_value(cell)]
     if not places:
@@ -79,9 +79,9 @@ def columns_of_rows(
 
 
 def _columns_of_values(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the quantities of columns with these values (N, n); None if no quantities fit.
+    """Return the quantities of columns with values (N, n), or None if no quantities fit.
 
-    Possible are a pose with or without a stamp, and a stamped pose with further columns.
+    The possibilities are a pose with or without a stamp, and a stamped pose with further columns.
     """
     if values.shape[1] == len(_FAST_LIO) and _is_gravity(values[:, -3:]):
         return _FAST_LIO
@@ -89,7 +89,7 @@ def _columns_of_values(values: FloatArray) -> tuple[str, ...] | None:
 
 
 def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a pose with or without a stamp; None if values (N, n) do not fit."""
+    """Return the columns of a pose with or without a stamp, or None if values (N, n) do not fit."""
     stamps: list[tuple[str, ...]] = [(), ("t",)]
     if _are_seconds_and_ns(values):
         stamps.append(("secs", "nsecs"))
@@ -104,14 +104,14 @@ def _pose_alone(values: FloatArray) -> tuple[str, ...] | None:
 
 
 def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
-    """Return the columns of a stamped pose and more columns; None if values (N, n) do not fit.
+    """Return the columns of a stamped pose and further columns, or None if nothing fits.
 
     The columns after the pose have empty names.
     """
     for pose in _POSES:
         n_more = values.shape[1] - 1 - len(pose)
-        # Any number of columns may follow a position and a quaternion; only those of a covariance
-        # may follow other poses.
+        # After a position and a quaternion, any number of columns may follow. After another pose,
+        # only the columns of a covariance may follow.
         may_have_more = pose == STAMPED_POSE[1:] or n_more in _COVARIANCES
         if (
             n_more > 0
@@ -125,10 +125,10 @@ def _pose_with_more(values: FloatArray) -> tuple[str, ...] | None:
 def _values_in(
     rows: Sequence[Sequence[str]], places: Sequence[int], n_columns: int
 ) -> FloatArray:
-    """Return the values (N, n) in the columns ``places`` of the first rows that have numbers there.
+    """Return the values (N, n) in the columns ``places`` of the first rows with numbers there.
 
-    Rows with another number of columns than ``n_columns`` are skipped. A first cell that is not a
-    number, such as a date, becomes 0.
+    Rows whose number of columns is not ``n_columns`` are skipped. If the first cell is not a
+    number, such as a date, it becomes 0.
     """
     values: list[list[float]] = []
     for cells in islice(
@@ -145,10 +145,10 @@ def _values_in(
 
 
 def _fits(pose: Sequence[str], values: FloatArray) -> bool:
-    """Whether values (N, n) can be those of a pose with these columns.
+    """Return whether values (N, n) can be a pose with these columns.
 
-    Quaternions must have unit length, and rotation matrices must be orthogonal. Rows with zeros
-    only have no pose and are ignored, but at least one row must have a pose.
+    Quaternions must have unit length, and rotation matrices must be orthogonal. Rows of zeros
+    contain no pose and are ignored, but at least one row must have a pose.
     """
     if UNNAMED[0] in pose:
         norms = np.linalg.norm(_values_of(UNNAMED, pose, values), axis=1)
@@ -170,13 +170,13 @@ def _fits(pose: Sequence[str], values: FloatArray) -> bool:
 def _values_of(
     names: Sequence[str], pose: Sequence[str], values: FloatArray
 ) -> FloatArray:
-    """Return the values (N, k) of k quantities; column i of ``values`` is the quantity pose[i]."""
+    """Return the values (N, k) of k quantities. Column i of ``values`` is the quantity pose[i]."""
     columns = [pose.index(name) for name in names]
     return values[:, columns]
 
 
 def _are_seconds_and_ns(values: FloatArray) -> bool:
-    """Whether the first two columns are whole seconds since 1970 and whole nanoseconds."""
+    """Return whether the first two columns are whole seconds since 1970 and nanoseconds."""
     stamps = values[:, :2]
     is_whole = (stamps == np.round(stamps)).all()
     # Seconds since 1970 have ten digits.
@@ -187,7 +187,7 @@ def _are_seconds_and_ns(values: FloatArray) -> bool:
 
 
 def _is_gravity(values: FloatArray) -> bool:
-    """Whether all vectors (N, 3) have the norm of gravity."""
+    """Return whether all vectors (N, 3) have the length of gravity."""
     lengths = np.linalg.norm(values, axis=1)
     shortest, longest = _GRAVITY_M_S2
     return bool(((lengths >= shortest) & (lengths <= longest)).all())

@@ -1,4 +1,4 @@
-"""Stamps of a table in whole nanoseconds, and their order."""
+"""Stamps of a table: conversion to whole nanoseconds, and order."""
 
 from decimal import Decimal
 from pathlib import Path
@@ -20,19 +20,19 @@ from hand_eye_calib.formats.trajectory_files.table import Table
 
 # Nanoseconds in a second.
 _NS = STAMP_UNITS["s"]
-# Largest median time between poses (s). If it is longer, the unit of the stamps is probably wrong.
+# If the median time between poses (s) is longer than this, the unit of the stamps is probably
+# wrong.
 _LONGEST_INTERVAL_S = 10
-# Numbers such as 20231114221320.5 are dates with a time of day. Smallest of these numbers: the
-# beginning of 2000-01-01.
+# Dates with a time of day as a number, such as 20231114221320.5, are at least this: 2000-01-01.
 _FIRST_PACKED = Decimal(20_000_101_000_000)
-# Dates with a time of day are below this number: the beginning of 2100-01-01.
+# Dates with a time of day as a number are below this: 2100-01-01.
 _END_OF_PACKED = Decimal(21_000_101_000_000)
-# Stamps have lost their last digits if at least this share of the poses have moved, but have the
-# stamp of the pose before.
+# Stamps have lost their last digits if this share of the poses, or more, have moved without a new
+# stamp.
 _COARSE_SHARE = 0.25
-# Stamps can be numbers of 32 bits if these have at least this step (s): since 1970, it is 128 s.
+# Stamps may be 32-bit numbers if such numbers have at least this step (s). Since 1970 it is 128 s.
 _SHORT_STEP_S = 1e-3
-# Poses are equal if no number of them differs by more than this: rounding.
+# Poses are equal, up to rounding, if no number differs by more than this.
 _SAME = 1e-12
 
 
@@ -56,8 +56,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     ----------
     table : Table
     stamp_unit : str or None
-        "s", "ms", "us" or "ns". If None, the unit is that in the column's name. Without a unit in
-        the name, it is inferred from the magnitude of the stamps.
+        "s", "ms", "us" or "ns". With None, the unit is in the column's name; without a unit in the
+        name, it is inferred from the size of the stamps.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         int((stamp * factor).to_integral_value()) for stamp in stamps
     )
     stamps_ns = np.fromiter(nanoseconds, dtype=np.int64, count=len(stamps))
-    # Only stamps in seconds have decimals, so the unit of stamps with decimals is clear.
+    # Only stamps in seconds have decimals, so decimals determine the unit.
     if not unit and not any(stamp % 1 for stamp in stamps):
         _refuse_unclear_unit(table, stamps_ns, recognised)
     for period_s in (DAY_S, WEEK_S):
@@ -101,7 +101,7 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
 
 
 def _unit_of_magnitude(largest: float) -> str:
-    """Return the unit of stamps since 1970 whose largest stamp has this value."""
+    """Return the unit of stamps since 1970, given the largest stamp."""
     for unit, digits in UNIT_EXPONENTS.items():
         if largest >= 10.0**digits:
             return unit
@@ -122,7 +122,7 @@ def _unpacked(stamps: list[Decimal]) -> list[Decimal]:
 def _refuse_unclear_unit(
     table: Table, stamps_ns: IntArray, recognised: str
 ) -> None:
-    """Raise an InputError if the time between poses is so long that the unit is probably wrong."""
+    """Raise an InputError if the interval of poses is so long that the unit is probably wrong."""
     intervals_s = np.abs(np.diff(stamps_ns.astype(float))) * 1e-9
     if len(intervals_s) and median(intervals_s) > _LONGEST_INTERVAL_S:
         raise InputError(
@@ -133,10 +133,10 @@ def _refuse_unclear_unit(
 
 
 def _without_restarts(stamps_ns: IntArray, period_s: int) -> IntArray:
-    """Return stamps that increase beyond the end of a day or of a week, where they restart at 0.
+    """Return stamps that increase over the end of a day or week, at which they restart at 0.
 
-    The stamps restart if a stamp in the last tenth of the period is followed by a stamp in the
-    first tenth. Stamps longer than one period are returned unchanged.
+    The stamps have restarted if a stamp in the last tenth of the period is followed by a stamp in
+    the first tenth. Stamps that exceed one period are returned unchanged.
     """
     period_ns = period_s * _NS
     if not len(stamps_ns) or stamps_ns.min() < 0 or stamps_ns.max() > period_ns:
@@ -153,7 +153,7 @@ def refuse_coarse(
 ) -> None:
     """Raise an InputError if the stamps (N,) of a table have lost their last digits.
 
-    The criterion: many poses have the stamp of the pose before, but other ``values`` (N, k).
+    They have, if many poses have the stamp of the previous pose, but other ``values`` (N, k).
     """
     if len(stamps_ns) < 2:
         return
@@ -180,9 +180,9 @@ def refuse_coarse(
 
 
 def _step_of_32_bits(different: IntArray) -> float:
-    """Return the spacing (s) of numbers of 32 bits if the stamps can be such numbers; 0 if not.
+    """Return the step (s) of 32-bit numbers if the stamps can be such numbers, or 0 if they cannot.
 
-    ``different`` are the different stamps, sorted. Between some of them there is only one step.
+    ``different`` are the different stamps, sorted. Some of them must differ by a single step.
     """
     step_s = float(np.spacing(np.float32(different[-1] / _NS)))
     is_multiple = not (different % max(1, round(step_s * _NS))).any()

@@ -32,21 +32,21 @@ from hand_eye_calib.formats.trajectory_files.columns import (
 )
 from hand_eye_calib.formats.trajectory_files.dates import decimals, stamp_of
 
-# Groups of quantities, each of which is an orientation. A tracker that is lost writes 0 for all
-# quantities of the group; a valid orientation is never all 0.
+# Groups of quantities that are an orientation. A tracker without track writes 0 for all quantities
+# of a group. A valid orientation is never all 0.
 _ORIENTATIONS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 
-# Largest number of different names in a column of sensors. A column with more names is about
+# Largest number of different names in a column of sensors. A column with more names contains
 # something else, such as images.
 _MOST_SENSORS = 20
 
-# Number of rows that are converted at once. It limits the memory for the texts of cells.
+# Number of rows that are converted together. It limits the memory for the texts of cells.
 _ROWS_AT_ONCE = 1000
 
 
 @dataclass
 class Table:
-    """Numbers of a trajectory, one row per pose. Rows without a pose are counted and skipped.
+    """Numbers of a trajectory, with one row per pose. Rows without a pose are counted and skipped.
 
     A row has no pose if a value is missing or not finite, or if its orientation is all 0.
 
@@ -58,14 +58,14 @@ class Table:
         Names of all columns.
     measures : str
         Kind of data to read: "poses", "positions", "rotations", "rates" or "twists" (velocities).
-        "auto" is replaced by the kind that the columns have.
+        "auto" is replaced by the kind according to the columns.
     expected : str
         Description of a row for messages.
     format : str
     is_transposable : bool
-        Whether the elements of a rotation matrix may be in the order of its rows or of its columns.
+        Whether a rotation matrix may be stored by rows or by columns.
     line_numbers, rows : array
-        Line number of each row with a pose, and the index of this row among all rows.
+        Line number of each row with a pose, and its index among all rows.
     n_rows : int
         Number of all rows, with and without a pose.
     first_skipped : int or None
@@ -77,21 +77,21 @@ class Table:
     images : list of str
         Name of the image of each row with a pose; empty without such a column.
     sensor_frame : str
-        Name of the sensor's frame; if empty, the frame gets the name of the file.
+        Name of the sensor's frame; if empty, the name of the file is used.
     guesses : list of str
         Notes for the user about properties that the file does not state.
     conventions : list of str
-        Conventions of the angles that fit the motion, the preferred one first.
+        Conventions of the angles that fit the motion. The first one has priority.
     at : dict of str to int
         Column of each quantity, such as "x" or "qw".
     units : dict of str to str
-        Units of the quantities; only those that the names of the columns state.
+        Units of the quantities, if stated in the names of the columns.
     stamp_names, stamp_at : sequence
         Quantities that together are the stamp, and their columns.
     stamp_unit : str
-        Unit of the stamps; if empty, it is inferred from their magnitude.
+        Unit of the stamps; if empty, it is inferred from the size of the stamps.
     second_unit : str
-        Unit of the time within a GPS week; empty if the name of the column does not state it.
+        Unit of the time within a GPS week; empty if not stated in the name of the column.
 
     Raises
     ------
@@ -145,7 +145,7 @@ class Table:
     def _refuse_unclear_columns(
         self, columns: Mapping[str, list[int]], quantities: Sequence[str]
     ) -> None:
-        """Raise an InputError if a quantity has no column or several columns."""
+        """Raise an InputError if a quantity has no column, or several columns."""
         if missing := [name for name in quantities if name not in columns]:
             listed = self._listed(self.names)
             has_accelerations = re.search(r", a(cc\w*)?_?x", listed)
@@ -176,7 +176,7 @@ class Table:
     def _set_stamp_units(self, units: Sequence[str]) -> None:
         """Set the units of the stamps and of the time within a GPS week.
 
-        ``units`` are the units that the names of all columns state.
+        ``units`` has the units in the names of all columns.
         """
         unit = units[self.stamp_at[-1]] if self.stamp_at else ""
         self.second_unit = unit if unit in STAMP_UNITS else ""
@@ -199,7 +199,7 @@ class Table:
         return shortened(", ".join(names), LONGEST_NAME)
 
     def values(self, names: Iterable[str] = ()) -> FloatArray:
-        """Return the values (N, k) of k quantities; without names, those of all quantities."""
+        """Return the values (N, k) of k quantities; without names, of all quantities."""
         quantities = [*self.at]
         all_values = np.asarray(self.numbers).reshape(-1, len(quantities))
         return (
@@ -220,13 +220,13 @@ class Table:
         lines : iterable of (int, object)
             Line number and content of each row.
         cells_of : callable
-            Splits the content of a row into cells.
+            Function that splits the content of a row into cells.
 
         Raises
         ------
         InputError
-            At the first line with another number of cells, or with text instead of a number; and if
-            the poses are those of several sensors.
+            At the first line with another number of cells, or with text instead of a number. Also
+            if the poses are from several sensors.
         """
         remaining = iter(lines)
         while numbered := list(islice(remaining, _ROWS_AT_ONCE)):
@@ -250,7 +250,7 @@ class Table:
     def fill_from_arrays(
         self, values: FloatArray, stamps: Sequence[Decimal | None] | None
     ) -> None:
-        """Add the rows of values (N, k) that have a pose and, if ``stamps`` are given, a stamp."""
+        """Add the rows of values (N, k) that have a pose and, with ``stamps``, also a stamp."""
         self._add_arrays(values, stamps, range(1, len(values) + 1))
 
     def _add_arrays(
@@ -259,7 +259,7 @@ class Table:
         stamps: Sequence[Decimal | None] | None,
         line_numbers: Sequence[int],
     ) -> None:
-        """Add rows as :meth:`fill_from_arrays` does, from lines with these numbers."""
+        """Add rows like :meth:`fill_from_arrays`, from lines with these numbers."""
         is_pose = np.isfinite(values).all(axis=1)
         if self._orientation_at:
             is_pose &= values[:, self._orientation_at].any(axis=1)
@@ -284,12 +284,12 @@ class Table:
     def _add_at_once(
         self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int]
     ) -> bool:
-        """Add rows of cells at once, column by column, if all their cells are plain numbers.
+        """Add rows of cells column by column, if all their cells are plain numbers.
 
         Returns
         -------
         bool
-            Whether the rows were added. If not, nothing has changed.
+            Whether the rows were added. If they were not, nothing has changed.
         """
         has_names = self._image_at or self._sensor_at
         if (
@@ -332,7 +332,7 @@ class Table:
             ) from None
 
     def _add(self, cells: Sequence[str], line_number: int) -> None:
-        """Add a row; if it has no pose, count it only.
+        """Add a row. If it has no pose, only count it.
 
         Raises
         ------
@@ -354,7 +354,7 @@ class Table:
         self.rows.append(row)
 
     def _add_stamp(self, cells: Sequence[str]) -> bool:
-        """Add the stamp of a row; return False if the stamp is missing."""
+        """Add the stamp of a row. Return False if it is missing."""
         if not self.stamp_at:
             return True
         texts = [cells[column] for column in self.stamp_at]
@@ -376,7 +376,7 @@ class Table:
         ValueError
             If a cell contains text instead of a number.
         """
-        # float is fast and reads almost every row. The other functions also read decimal commas,
+        # float is fast, and reads almost every row. The other functions also read decimal commas,
         # marks of missing values, and angles in degrees, minutes and seconds.
         try:
             return [float(cells[column]) for column in self._value_at]
@@ -389,8 +389,8 @@ class Table:
             ]
 
     def _is_pose(self, values: Sequence[float]) -> bool:
-        """Whether the values of a row are finite, and its orientation is not all 0."""
-        # Check the sum first, because this is fast: if it is finite, all values are. But the sum of
+        """Return whether the values of a row are finite, and its orientation is not all 0."""
+        # Check the sum first, which is fast: if it is finite, all values are finite. But the sum of
         # large finite values may be infinite.
         if not math.isfinite(sum(values)) and not all(
             map(math.isfinite, values)
@@ -403,9 +403,9 @@ class Table:
     def _padded(
         self, cells: Sequence[str], line_number: int, content: object
     ) -> Sequence[str]:
-        """Return the cells of a row with too few or too many cells, one for each column.
+        """Return a row with too few or too many cells with one cell for each column.
 
-        An empty cell at the end is dropped. Empty cells are appended to a row with a stamp only.
+        An empty last cell is dropped. If a row has only a stamp, empty cells are appended.
 
         Raises
         ------

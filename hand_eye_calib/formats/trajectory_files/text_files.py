@@ -1,4 +1,4 @@
-"""Tables from text files, whose format and columns are stated by options or recognised."""
+"""Read tables from text files, whose format and columns are stated by options or recognised."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -39,7 +39,7 @@ from hand_eye_calib.formats.trajectory_files.layout import (
 from hand_eye_calib.formats.trajectory_files.recognition import STAMPED_POSE
 from hand_eye_calib.formats.trajectory_files.table import Table
 
-# Formats whose columns have a fixed order: the columns, and the description of a row in messages.
+# Formats with a fixed order of columns: these columns, and a description of a row for messages.
 _FORMATS: dict[str, tuple[Sequence[str], str]] = {
     "tum": (TUM, f"8 numbers, {TUM_COLUMNS}"),
     "kitti": (MATRIX, "12 numbers, the first three rows of a pose"),
@@ -53,22 +53,21 @@ _EXPECTED = (
     "lines of a trajectory: save the poses of MATLAB, HDF5, Arrow, spreadsheets, receivers and "
     "autopilots as csv, a model of COLMAP as text"
 )
-# Columns in the message about a file without names of columns, by their number, or else.
+# Examples of columns for the message about a file without names of columns, by their number.
 _EXAMPLES = {4: "t,wx,wy,wz", 7: "t,x,y,z,roll_deg,pitch_deg,yaw_deg"}
 _EXAMPLE = "t,x,y,z,qx,qy,qz,qw"
 # Name of the file with the stamps of the poses in another file of the same folder, as in KITTI.
 _TIMES = "times.txt"
-# Bytes of Latin-1 that may occur in headers: the signs for degree, squared and micro, and letters
-# with accents.
+# Bytes of Latin-1 that are usual in headers: degree, squared, micro, and letters with accents.
 _LATIN_1 = [bytes([code]) for code in (0xB0, 0xB2, 0xB5, *range(0xC0, 0x100))]
 # Bytes of the printable characters of ASCII, and of white space.
 _ASCII = bytes([*b"\t\n\r", *range(32, 127)])
-# Data is a text in Latin-1 only if less than this share of its bytes are not ASCII.
+# A text is in Latin-1 only if less than this share of its bytes are not ASCII.
 _FEW_LETTERS = 0.05
 
 
 def read_table(path: str | Path, options: FileOptions) -> Table:
-    """Return the rows of a file, in the format of the options or the recognised format.
+    """Return the rows of a file, in the format of the options or in the recognised format.
 
     Raises
     ------
@@ -86,7 +85,7 @@ def read_table(path: str | Path, options: FileOptions) -> Table:
         table: Table | None = read(path, data, options)
         if table is not None:
             return table
-    # A text contains no zero bytes. Replace them by a byte that is invalid in UTF-8, so that such a
+    # A text contains no zero bytes. Replace them by a byte that is invalid in UTF-8, so that the
     # file is rejected.
     text = decoded(path, _in_utf8(data).replace(b"\0", b"\xff"), _EXPECTED)
     needs_names = not options.columns and options.format in (AUTO, "csv")
@@ -130,9 +129,9 @@ def _in_utf8(data: bytes) -> bytes:
 
 
 def _with_options(layout: Layout, options: FileOptions) -> Layout:
-    """Return the layout with the format and columns of the options.
+    """Return the layout with the format and columns from the options.
 
-    Matrices in the stated columns are not transposable: their transposition is not guessed.
+    Matrices in stated columns are not transposable: no transposition is guessed.
     """
     format = options.format
     columns = layout.names
@@ -140,8 +139,8 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
         format = "csv"
         columns = tuple(name.strip() for name in options.columns.split(","))
     elif format == AUTO:
-        # Only the option `times` is set, which is for poses without stamps. Keep a layout without a
-        # stamp; any other file must be in the format kitti.
+        # Only the option `times` is set, which is for poses without stamps. A layout without a
+        # stamp is kept. Any other file must have the format kitti.
         if layout.columns and not stamp_columns(
             named_columns(layout.columns)[0]
         ):
@@ -156,7 +155,7 @@ def _with_options(layout: Layout, options: FileOptions) -> Layout:
 
 
 def _guesses_of(layout: Layout) -> list[str]:
-    """Return notes on the recognised format and columns. They are appended to the file's path."""
+    """Return notes about the recognised format and columns, as they follow the file's path."""
     if layout.format == "tum":
         return []
     order = ", qw qx qy qz" if layout.format == "euroc" else ""
@@ -204,7 +203,7 @@ def _empty_table(
 
 
 def _advice_on_columns(row: Sequence[str]) -> str:
-    """Return the message about rows whose columns have no names and do not fit a known order."""
+    """Return the message about rows whose columns are unnamed and fit no known order."""
     if len(row) > len(TUM) and are_whole(row):
         return f"rows of {len(row)} cells without a decimal point; {DECIMAL_COMMAS}"
     naming = f"name the {len(row)} with `columns`, such as {_EXAMPLES.get(len(row), _EXAMPLE)}"
@@ -219,7 +218,7 @@ def _advice_on_columns(row: Sequence[str]) -> str:
 def _add_times(table: Table, options: FileOptions) -> None:
     """Add stamps to poses without stamps, from the file of the option ``times``.
 
-    If no option is set, the file times.txt in the folder of the poses is used if it exists.
+    By default, the file times.txt in the folder of the poses is used, if it exists.
     """
     if table.stamp_at:
         return
@@ -234,7 +233,7 @@ def _add_times(table: Table, options: FileOptions) -> None:
 
 
 def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
-    """Return the stamp of each pose from a file with one stamp for each row of the poses."""
+    """Return the stamp of each pose, from a file with a stamp for each row of the poses."""
     lines = lines_of(times, read_text(times, "stamps"), after=0)
     table = Table(times, ["t"], "stamps", "a stamp")
     table.fill(lines, lambda text: text.split()[:1])

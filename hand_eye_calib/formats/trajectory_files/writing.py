@@ -14,7 +14,7 @@ from hand_eye_calib.formats.trajectory_files.dates import seconds
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a text file in the format tum, which evo also reads.
 
-    An existing file is replaced. Reading the file returns the same stamps and poses.
+    An existing file is replaced. A file that is read again has the same stamps and poses.
 
     Parameters
     ----------
