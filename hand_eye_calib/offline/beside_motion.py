@@ -1,4 +1,4 @@
-"""Measurements of the extrinsic in addition to motion, from the bag of the recording."""
+"""Measurements of the extrinsic from the bag of a recording, in addition to its motion."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ def switched_off(values: Mapping[str, Any]) -> list[str]:
 def with_measurements(
     snapshot: "Snapshot", paths: Sequence[Path], without: Collection[str] = ()
 ) -> "tuple[Snapshot, list[str]]":
-    """Add the measurements in addition to motion that a bag has, and the paths of the bag.
+    """Add the measurements in a bag that do not come from motion, and the paths of the bag.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def with_measurements(
     -------
     snapshot : Snapshot
     notes : list of str
-        Which topics are used, and why a topic is not used.
+        Which topics are used, and why other topics are not.
     """
     measurements: list[Any] = []
     notes: list[str] = []

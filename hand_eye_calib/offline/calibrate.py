@@ -63,7 +63,7 @@ _Invert: TypeAlias = Literal["none", "poses", "orientations"]
 _Kind: TypeAlias = Literal["odometry", "exact"]
 _Order: TypeAlias = Literal["xyzw", "wxyz", "yzwx"]
 
-# Endings of files with trajectories or samples of an arm, which are no bags.
+# Endings of files with trajectories or samples of an arm. They are not bags.
 _TABLES = (".npz", ".json", ".samples", ".tum", ".txt", ".csv", ".yaml", ".yml")
 
 
@@ -109,14 +109,14 @@ def calibrate(
 ) -> Calibration:
     """Estimate the pose of the child sensor in the parent sensor's frame from two trajectories.
 
-    At most 100,000 pose pairs are used; ``max_pairs`` changes this limit. The streams are checked,
-    too. If a check is certain of a clock offset, a unit or inverse poses, the solve uses this
-    option, and the result has a warning. An option that the caller sets is never changed.
+    At most 100,000 pose pairs are used; ``max_pairs`` changes this limit. The streams are also
+    checked. If a check is certain of a clock offset, a unit or inverse poses, it sets the option
+    for the solve, and the result has a warning. An option that the caller sets is never changed.
 
     Parameters
     ----------
     parent, child : Trajectory, path, array or DataFrame
-        Poses of each sensor in its own world, m. Anything but a Trajectory is read by
+        Poses of each sensor in its own world, m. Anything except a Trajectory is read by
         :func:`hand_eye_calib.read_trajectory`; the sensors are named after their files. One of both
         may be positions (:meth:`Trajectory.from_positions`): the result is the lever arm. Either
         may be rotations or angular rates (:meth:`Trajectory.from_rates`): the result is the
@@ -133,17 +133,18 @@ def calibrate(
         a bag. Default: auto.
     checks : bool, optional
         False: the streams are not checked, the result is not compared with other references and
-        halves of the recording, and there is no second solve. True: the result is compared even
-        if ``reference`` is set. Default: it is compared unless ``reference`` is set.
+        halves of the recording, and there is no second solve. True: the result is compared even if
+        ``reference`` is set. By default, it is compared unless ``reference`` is set.
     progress : callable, optional
-        Called with the finished share of the work, 0 to 1, and the name of the next step.
+        Function that is called with the finished share of the work, 0 to 1, and the name of the
+        next step.
 
     Raises
     ------
     ConfigError
         If an option has a value that is not allowed.
     InputError
-        If an argument is no trajectory, or if both have the same sensor frame.
+        If an argument is not a trajectory, or if both have the same sensor frame.
     NotEnoughDataError
         If too few poses can be paired.
 
@@ -207,7 +208,7 @@ def _read_both(
     child: TrajectoryLike | None,
     topics: Mapping[str, str | None],
 ) -> Sequence[Trajectory]:
-    """Return the trajectories of parent and child; without a child, ``parent`` is a bag."""
+    """Return the trajectories of parent and child. Without a child, ``parent`` is a bag."""
     if parent is None:
         raise InputError(
             "the parent must be a trajectory, a file or a bag; got None"
@@ -275,7 +276,7 @@ def _read_bag(
 
 
 def _options_in_words() -> list[str]:
-    """Return the parameters of :func:`calibrate` that are options, as lines of its docstring."""
+    """Return the options among the parameters of :func:`calibrate`, as lines of its docstring."""
     names = inspect.signature(calibrate).parameters
     lines = []
     for field in fields(CalibratorConfig):
@@ -311,12 +312,12 @@ if calibrate.__doc__:
 
 
 def prior_fields(prior: Prior) -> dict[str, str]:
-    """Return a prior as options: names of attributes of CalibratorConfig, and texts.
+    """Return the options that state a prior: attributes of CalibratorConfig, with their texts.
 
     Raises
     ------
     ConfigError
-        If an axis is unknown or its value is not a text or a pair of numbers.
+        If an axis is unknown, or its value is neither a text nor a pair of numbers.
     """
     if not isinstance(prior, Mapping):
         raise ConfigError(
@@ -359,7 +360,7 @@ def cross_check(
 ) -> CrossCheck:
     """Compare a result with robust least squares on the whole recording and on both halves.
 
-    A solve with the method or the reference ``auto`` makes this comparison itself.
+    With the method or the reference ``auto``, a solve already makes this comparison.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Least squares from sums over blocks of time.
 
-The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The table of a block of time is its
-matrix of products ``[J y]' W [J y]`` (p + 1, p + 1). The first p rows of a table are ``[H S]``: the
+The p unknowns x minimise the squares of ``W^(1/2) (J x - y)``. The table of a block of time is the
+matrix of products ``[J y]' W [J y]`` (p + 1, p + 1). Its first p rows are ``[H S]``: the
 information ``H = J' W J`` and the score ``S = J' W y``. The table of several blocks is the sum of
-their tables. So the solution for any set of blocks (all, all except one, before or since a time)
-needs only sums of tables.
+their tables. Therefore the solution for any set of blocks (all, all except one, before or since a
+time) needs only sums of tables.
 """
 
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 
-# Term added to the diagonal of an information matrix whose diagonal is scaled to 1. It is above
+# Term on the diagonal of an information matrix that was scaled to a diagonal of 1. It is above
 # rounding, and makes unknowns zero along directions without information.
 _DAMPING = 1e-10
 
-# An unknown has no information if the square root of its diagonal element is not above this.
+# An unknown has no information if the square root of its diagonal element is at most this.
 _MIN_ROOT = 1e-30
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sums (B, ...) over B blocks in order of time: tables, or other arrays that can be added.
+    """Sums (B, ...) of B blocks in order of time: tables, or other arrays that can be added.
 
     Examples
     --------
@@ -41,8 +41,8 @@ class Blocks:
     ) -> "Blocks":
         """Return the tables of weighted rows ``W^(1/2) [J y]`` (K, d, p + 1) in equal blocks.
 
-        ``probes`` (K, d, p + 1), if any, are instrumental variables: they replace the left factor
-        of the products.
+        ``probes`` (K, d, p + 1) are instrumental variables, if there are any. They replace the left
+        factor of the products.
         """
         n_columns = rows.shape[-1]
         left_factors = np.array_split(
@@ -98,8 +98,8 @@ class Blocks:
     def shift_since(self, cuts: IntArray, prior: FloatArray) -> FloatArray:
         """Return information and score ``[H S]`` (C, p, p + 1) of a shift at each of the cuts (C,).
 
-        A shift is a change of the unknowns x from the blocks before a cut to those since the cut.
-        ``prior`` (p, p) is added to the information on x before the cut.
+        A shift is a change of the unknowns x at a cut. ``prior`` (p, p) is added to the information
+        on x before the cut.
         """
         before = self.before(cuts)
         covariances = inverse(information(before) + prior)
@@ -107,7 +107,7 @@ class Blocks:
         return shift_evidence(self.since(cuts), estimates, covariances)
 
     def solve(self, columns: Sequence[int]) -> FloatArray:
-        """Solve all blocks for k of the unknowns, by index; the other unknowns are zero."""
+        """Solve all blocks for k unknowns, given by index. The other unknowns are zero."""
         return solve(self.total, columns)
 
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
@@ -128,12 +128,12 @@ def score(tables: FloatArray) -> FloatArray:
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
-    """Return the inverses of matrices (..., p, p); pseudo-inverses if any of them is singular."""
+    """Return the inverses of matrices (..., p, p); if one of them is singular, pseudo-inverses."""
     try:
         inverses = np.linalg.inv(matrices)
     except np.linalg.LinAlgError:
-        # For exact poses, the information along some directions is so large that along other
-        # directions only rounding remains.
+        # Exact poses have so much information along some directions that it is only rounding along
+        # others.
         inverses = np.linalg.pinv(matrices)
     return np.asarray(inverses, dtype=float)
 

@@ -1,7 +1,7 @@
 """Options of the engine and of the node: name, unit, range, default and help text.
 
 Parameters of the node, options of the command line, ``config/calibrator.yaml`` and tables of the
-documentation are generated from these dataclasses or tested against them.
+documentation are generated from these dataclasses, or tested against them.
 """
 
 import math
@@ -40,7 +40,7 @@ EXPORT_FORMATS = (
     ),
     *("easy_handeye2", "opencv", "numpy"),
 )
-#: Files of a robot description and of a launch, beside the formats of other programs.
+#: File formats of robot descriptions and launch files. They are not formats of other programs.
 ROBOT_FORMATS = ("urdf", "launch")
 PAIR_BY = ("time", "row", "name")
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
@@ -60,8 +60,8 @@ POSE_TYPES = (
 
 BACKENDS = ("fast", "ipopt")
 
-# Largest time offset (s): about the largest int64 number of nanoseconds. Clocks may count from
-# 1970, from 1904, from the start of the computer or from the start of the GPS week.
+# Largest time offset (s): about the largest int64 number of nanoseconds. Clocks may start in 1970,
+# in 1904, with the computer or with the GPS week.
 _MAX_OFFSET_S = 9.2e9
 
 
@@ -71,7 +71,7 @@ class MethodRecord(NamedTuple):
     Attributes
     ----------
     uses_reference : bool
-        Whether the method solves the motion pairs of a reference. Otherwise it uses all poses.
+        Whether the method solves the motion pairs of a reference. Otherwise, it uses all poses.
     rejects_outliers : bool
         Whether the method rejects outliers, so that a few jumps hardly change the result.
     backends : tuple of str
@@ -94,7 +94,7 @@ METHODS = {
 
 
 def require_backend(method: str, backend: str) -> None:
-    """Raise ConfigError if a method does not have a backend. The message lists those that have."""
+    """Raise ConfigError if a method lacks a backend. The message lists the methods that have it."""
     if backend not in METHODS[method].backends:
         able = [
             name
@@ -107,7 +107,7 @@ def require_backend(method: str, backend: str) -> None:
 
 
 def _both(default: str, doc: str, **settings: Any) -> dict[str, Any]:
-    """Return one option for each stream; its name replaces {} in the help text ``doc``."""
+    """Return an option for each stream. Its name replaces {} in the help text ``doc``."""
     return {
         stream: option(default, doc.format(stream), **settings)
         for stream in ("parent", "child")
@@ -195,7 +195,7 @@ class CalibratorConfig(OptionSet):
     given: InitVar[Collection[str] | None] = None
 
     def __new__(cls, **values: Any) -> Self:
-        """Store the names of the options that are passed."""
+        """Store the names of the passed options."""
         config = super().__new__(cls)
         names = values if values.get("given") is None else values["given"]
         object.__setattr__(config, "given", frozenset(names) - {"given"})
@@ -414,7 +414,7 @@ class CalibratorConfig(OptionSet):
     def require_poses(self, request: str) -> None:
         """Raise ConfigError if a sensor does not measure poses.
 
-        The message begins with ``request``, the name of the feature that needs poses.
+        The message begins with ``request``, the feature that needs poses.
         """
         if self.measured != "poses":
             raise ConfigError(
@@ -458,7 +458,7 @@ def defaults_of(names: Iterable[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeConfig(OptionSet):
-    """Options that only the node has, besides those of the engine."""
+    """Options that only the node has, in addition to the options of the engine."""
 
     solve_period: float = option(
         2.0, "Time between solves.", unit="s", within=(0.05, 3600.0)

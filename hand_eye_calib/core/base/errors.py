@@ -1,8 +1,8 @@
 """Exceptions that this package raises on purpose.
 
-A message is one line with the expected value, the value found, and the remedy. The command line and
-the node print it unchanged. Any other exception is a defect of the package; it is printed with its
-traceback.
+A message is one line with the expected value, the actual value, and the remedy. The command line
+and the node print it unchanged. Any other exception is a defect of the package, and is printed with
+its traceback.
 """
 
 from collections.abc import Iterator, Mapping
@@ -65,7 +65,7 @@ class UnclearStreamsError(InputError):
 
 
 class NoPoseError(InputError):
-    """A message without a pose: zero quaternion, value that is not finite, or no GNSS fix."""
+    """A message has no pose: zero quaternion, a value that is not finite, or no GNSS fix."""
 
 
 class NotEnoughDataError(InputError):
@@ -101,10 +101,10 @@ def installing(extra: str) -> str:
 
 
 def required(module: str, purpose: str, extra: str) -> Any:
-    """Return a module of an optional package; raise MissingDependencyError if not installed.
+    """Return a module of an optional package, or raise MissingDependencyError.
 
-    ``purpose`` is the request that needs the module, ``extra`` the name of the extra; both are for
-    the message.
+    The message contains ``purpose``, the request that needs the module, and ``extra``, the name of
+    the extra.
     """
     try:
         return import_module(module)

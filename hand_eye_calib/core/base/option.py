@@ -15,10 +15,10 @@ OptionValue: TypeAlias = bool | int | float | str
 Options: TypeAlias = Mapping[str, Any]
 OptionField: TypeAlias = dataclasses.Field[Any]
 
-#: Whole numbers must be smaller than this, so that they fit into signed integers of 64 bits.
+#: Upper bound of integers (exclusive). They must fit into signed integers of 64 bits.
 LARGEST_INT = 1 << 63
 
-# A number and its unit, such as 35ms or -0.1 s.
+# Number with a unit, such as 35ms or -0.1 s.
 _NUMBER_WITH_UNIT = re.compile(
     r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)"
 )
@@ -84,7 +84,7 @@ def option_name(field: OptionField) -> str:
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     """Return ``; did you mean X?`` with the most similar candidates; empty if none is similar.
 
-    Two candidates are named if both need the smallest number of edits.
+    If two candidates need the smallest number of edits, both are named.
     """
     import difflib
 
@@ -105,7 +105,7 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     nearest = [
         candidate for candidate in similar if n_edits[candidate] == fewest
     ]
-    # A candidate with the same letters comes first: letters are swapped more often than added.
+    # A candidate with the same letters is first: letters are swapped more often than added.
     nearest.sort(key=lambda candidate: sorted(candidate) != sorted(word))
     return f"; did you mean {' or '.join(nearest[:2])}?"
 
@@ -113,9 +113,10 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
 def _count_edits(word: str, other: str) -> int:
     """Count the edits between two words: letters added, removed, replaced or swapped.
 
-    The number is the distance of optimal string alignment. A swap exchanges two adjacent letters.
+    The result is the distance of optimal string alignment. A swap exchanges two neighbouring
+    letters.
     """
-    # Distances between the beginnings of both words, by their lengths.
+    # Distances between the beginnings of both words, by the lengths of the beginnings.
     distances = {(row, 0): row for row in range(len(word) + 1)}
     distances |= {(0, column): column for column in range(len(other) + 1)}
     for row, letter in enumerate(word, 1):
@@ -171,7 +172,7 @@ def check_value(field: OptionField, value: object) -> OptionValue:
 
 
 def _type_of(field: OptionField) -> type:
-    """Return the type of an option. An option with words is otherwise a number."""
+    """Return the type of an option. An option with words is a number if it is not a word."""
     return float if field.metadata["words"] else type(field.default)
 
 
@@ -206,7 +207,7 @@ def _without_unit(value: object, unit: str) -> str:
 def _as_float(value: object, has_words: bool) -> object:
     """Return a whole number as float, and the text of a number if the option allows words.
 
-    Other values are returned unchanged.
+    Any other value is returned unchanged.
     """
     if type(value) is int or (has_words and isinstance(value, str)):
         with contextlib.suppress(ValueError):
@@ -215,7 +216,7 @@ def _as_float(value: object, has_words: bool) -> object:
 
 
 def _checked_text(field: OptionField, text: str) -> str:
-    """Return the text of an option; raise ConfigError if it is no choice or has another form."""
+    """Return the text of an option, or raise ConfigError if its choice or form is wrong."""
     name = option_name(field)
     choices = field.metadata["choices"]
     if choices is not None and text not in choices:
@@ -230,7 +231,7 @@ def _checked_text(field: OptionField, text: str) -> str:
 
 
 def _checked_number(field: OptionField, value: float) -> float:
-    """Return the number of an option; raise ConfigError if it is out of range."""
+    """Return the number of an option, or raise ConfigError if it is out of range."""
     name = option_name(field)
     if not math.isfinite(value):
         raise ConfigError(f"{name} must be a finite number; got {value}")
@@ -246,7 +247,7 @@ def _checked_number(field: OptionField, value: float) -> float:
 
 
 class OptionSet:
-    """Base class of dataclasses whose fields are options. Values are checked when one is made."""
+    """Base class of dataclasses whose fields are options. The constructor checks the values."""
 
     given: frozenset[str]
     __dataclass_fields__: ClassVar[dict[str, OptionField]]

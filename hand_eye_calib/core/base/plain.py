@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 # Mapping of JSON or YAML: names to plain values.
 Document: TypeAlias = dict[str, Any]
 
-# Upper bound of numbers in files, so that products of several numbers are finite.
+# Upper bound of numbers in files. Products of several such numbers are finite.
 _MAX_NUMBER = 1e50
 
 
@@ -44,7 +44,7 @@ def plain(value: Any) -> Any:
 
 
 def _plain_member(member: Enum) -> Any:
-    """Return the plain value of a member of an enum."""
+    """Return the plain value of a member of an enumeration."""
     value = member.value
     return value.replace(" ", "_") if isinstance(value, str) else plain(value)
 
@@ -58,11 +58,11 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     ----------
     kind : type
         A dataclass, an enum, float, int, bool or str; or a tuple, a Mapping or a union of these
-        types. For an array type, ``value`` must be an array already.
+        types. For an array type, ``value`` must already be an array.
     value : plain data
         Value to convert.
     **names
-        Types by name, which the module of a dataclass imports only for type checkers.
+        Types by name, for names that the module of a dataclass imports only for type checkers.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
 
 
 def _one_of(kinds: Sequence[Any], value: Any) -> Any:
-    """Convert plain data to the first type of a union that fits; None stays None."""
+    """Convert plain data to the first fitting type of a union. None stays None."""
     if value is None:
         return None
     kinds = [kind for kind in kinds if kind is not types.NoneType]
@@ -110,7 +110,7 @@ def _collection(kind: Any, value: Any) -> Any:
         return tuple(
             from_plain(args[0], item) for item in _of_type(Sequence, value)
         )
-    # From NumPy 2.5 on, the origin of an array type is NDArray; before, it is np.ndarray.
+    # Since NumPy 2.5, the origin of an array type is NDArray; before, it was np.ndarray.
     assert origin in (np.ndarray, NDArray), kind
     return _of_type(np.ndarray, value)
 
@@ -121,7 +121,7 @@ def _member(kind: type[Enum], value: Any) -> Enum:
     return by_plain[value] if value in by_plain else kind(value)
 
 
-# Cached, because resolving type hints takes longer than the rest of a conversion.
+# Type hints are cached. Resolving them takes longer than the rest of a conversion.
 _hints = cache(get_type_hints)
 
 

@@ -1,7 +1,7 @@
 """Module search path without the current folder, for processes that the package starts.
 
 ``python -m`` and ``python -c`` search the current folder first. A file ``queue.py`` in this folder
-would be run in place of the module of the standard library.
+would run instead of the module of the standard library.
 """
 
 import os
@@ -30,7 +30,7 @@ def trusted_path() -> list[str]:
 
 
 def trusted_environment() -> dict[str, str]:
-    """Return the environment for a Python process that finds the same modules as this process.
+    """Return the environment for a Python process that must find the same modules.
 
     ``PYTHONSAFEPATH`` prevents the process from searching its current folder.
     """
@@ -39,10 +39,10 @@ def trusted_environment() -> dict[str, str]:
 
 @contextmanager
 def starting_trusted() -> Iterator[None]:
-    """Set the environment of :func:`trusted_environment` for processes that the block starts.
+    """Set the environment of :func:`trusted_environment` for processes that start in the block.
 
-    At the end of the block, the environment is restored. This is for ``multiprocessing``, which has
-    no argument for the environment.
+    The environment is restored at the end of the block. ``multiprocessing`` needs this, because it
+    has no argument for the environment.
     """
     settings = _settings()
     before = {name: os.environ.get(name) for name in settings}

@@ -2,7 +2,7 @@
 
 Each layer and each extra has a function ``register()`` in its ``__init__.py``. The package calls
 these functions once, when it is imported. A registered function imports its module only when it is
-called, so that importing the package takes little time.
+called, so the import of the package takes little time.
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ class Command(NamedTuple):
 
 
 class Route(NamedTuple):
-    """Extension of the command ``calibrate`` for other data than two streams.
+    """Extension of the command ``calibrate`` for data other than two streams.
 
     Attributes
     ----------
@@ -64,8 +64,8 @@ class Route(NamedTuple):
     takes : callable
         ``takes(arguments)`` returns whether the route applies to parsed arguments.
     run : callable
-        ``run(arguments, restore_urls)`` calibrates and returns the exit code. ``restore_urls``
-        replaces paths of downloaded files by their URLs in plain values.
+        Function ``run(arguments, restore_urls)`` that calibrates and returns the exit code.
+        ``restore_urls`` replaces the paths of downloaded files by their URLs in plain values.
     """
 
     add_arguments: Callable[[Any], None]
@@ -74,7 +74,7 @@ class Route(NamedTuple):
 
 
 class BesideMotion(NamedTuple):
-    """A source of measurements of the extrinsic beside motion, for bags.
+    """Source of measurements of the extrinsic that do not come from motion, for bags.
 
     Attributes
     ----------
@@ -99,11 +99,12 @@ class Measure(NamedTuple):
     Attributes
     ----------
     kind : str
-        Kind of data of this stream together with a stream of poses: a name in ``KINDS``.
+        Kind of data of this stream together with a stream of poses, as a name in ``KINDS``.
     needs_poses : str
         Reason why the other stream must measure poses; empty if it may measure the same quantity.
     read_as : str
-        Quantity that is read from messages, if it is not the measured one; otherwise empty.
+        Quantity that is read from messages, if it differs from the measured quantity; otherwise
+        empty.
     is_parent : bool
         Whether only the parent may measure this quantity.
     """
@@ -120,7 +121,7 @@ class ExtraRule(NamedTuple):
     Attributes
     ----------
     after : str
-        Name of the rule that precedes this rule in the table of rules.
+        Name of the preceding rule in the table of rules.
     forbids : bool
         Whether the reasons of the rule lead to DO NOT USE; otherwise to USE WITH CARE.
     when : str
@@ -156,23 +157,23 @@ COMMANDS: Registry[Command] = Registry("command")
 #: is run.
 ROUTES: Registry[Route] = Registry("way to calibrate")
 
-#: Sources of measurements of the extrinsic beside motion.
+#: Sources of measurements of the extrinsic that do not come from motion.
 BESIDE_MOTION: Registry[BesideMotion] = Registry(
     "source of measurements beside motion"
 )
 
-#: Functions ``run(arguments, bags_of_recordings)`` that join several recordings of a rig into one
+#: Functions ``run(arguments, bags_of_recordings)`` that combine several recordings of a rig in one
 #: result. They return the exit code.
 SEVERAL_RECORDINGS: Registry[Callable[..., int]] = Registry(
     "way to join recordings"
 )
 
 #: Functions ``start(session, installed, reason, log)`` that monitor the mount. ``installed`` is the
-#: installed transform; ``reason`` explains why it is unknown.
+#: installed transform; if it is unknown, ``reason`` explains this.
 MOUNT_MONITORS: Registry[Callable[..., Any]] = Registry("monitor of the mount")
 
-#: Functions ``compare(arguments)`` of the command ``compare`` for other files than results. They
-#: return the exit code, None for other files.
+#: Functions ``compare(arguments)`` of the command ``compare`` for files other than results. They
+#: return the exit code, or None for files that they do not accept.
 COMPARISONS: Registry[Callable[[Any], int | None]] = Registry("comparison")
 
 #: Methods of a result that need a layer above the core: save, plot, report, export.
@@ -181,18 +182,19 @@ RESULT_METHODS: Registry[Callable[..., Any]] = Registry("method of a result")
 #: Functions ``write(output_directory, session_result)`` that write pages of a session of the node.
 SESSION_PAGES: Registry[Callable[..., None]] = Registry("page of a session")
 
-#: Functions ``read(bag, stream, topic, rest)`` that read messages that are not poses, by message
-#: type or as "images of a target". ``rest`` is the text after the topic in the name of the source.
+#: Functions ``read(bag, stream, topic, rest)`` that read messages without poses. The key is the
+#: message type, or "images of a target". ``rest`` is the text after the topic in the name of the
+#: source.
 BAG_READINGS: Registry[Callable[..., Any]] = Registry("kind of messages")
 
-#: Functions ``read(topic, measures)`` that return the reader of the messages of a live topic that
-#: are integrated to poses, by message type. The reader converts the bytes of a message to
+#: Functions ``read(topic, measures)`` that return the reader of a live topic whose messages are
+#: integrated to poses. The key is the message type. The reader converts the bytes of a message to
 #: ``PoseFields``.
 LIVE_READINGS: Registry[Callable[[str, str], Any]] = Registry(
     "kind of live messages"
 )
 
-#: Functions that return a module for images of a target: "folder" detects targets in the images of
+#: Functions that return a module for images of a target. "folder" detects targets in the images of
 #: a folder, and "corners" draws the corners of the target on the images.
 TARGET_IMAGES: Registry[Callable[[], Any]] = Registry(
     "reader of images of a target"
@@ -205,7 +207,7 @@ REPORT_PICTURES: Registry[Callable[[Any, Any, str], Any]] = Registry(
 )
 
 #: Functions ``read(path, content, options)`` that read trajectory files of other programs. They
-#: return None for a file of another format.
+#: return None for a file that they do not accept.
 FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
 
 #: Quantities that a stream may measure: values of the options ``parent_measures`` and
@@ -213,15 +215,15 @@ FILE_READERS: Registry[Callable[..., Any]] = Registry("reader of files")
 MEASURES: Registry[Measure] = Registry("measure")
 
 #: Axes that a kind of data can never determine, by the name of the kind. Kinds that can determine
-#: all axes are missing.
+#: all axes are left out.
 OUT_OF_REACH: Registry[tuple[str, ...]] = Registry("kind of streams")
 
 #: Functions that return a kind of data (:class:`hand_eye_calib.core.engine.kinds.Kind`), by the
 #: name of the kind.
 KINDS: Registry[Callable[[], Any]] = Registry("kind of streams")
 
-#: Kinds of data that alone obey an option, by the field name of the option. The default of such an
-#: option means unknown.
+#: Kinds of data that obey an option which other kinds ignore, by the field name of the option. The
+#: default value of such an option means unknown.
 KINDS_OF_OPTIONS: Registry[str] = Registry("option of one kind of streams")
 
 #: Functions that return the sentences of findings

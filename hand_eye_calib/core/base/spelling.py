@@ -1,7 +1,8 @@
 """Spelling of options in messages: on the command line, in Python, and in files and parameters.
 
 The engine writes options by their public names, such as ``prior.z 1.85+/-0.02``. A user of the
-command line types ``--prior z=1.85+/-0.02``, a Python program has ``prior={"z": (1.85, 0.02)}``.
+command line types ``--prior z=1.85+/-0.02``, and a Python program has ``prior={"z": (1.85,
+0.02)}``.
 """
 
 import re
@@ -25,18 +26,18 @@ class Interface(Enum):
     NODE = "node"
 
 
-#: Value of a prior that the user has to measure. Messages contain an example in its place.
+#: Value of a prior that the user must measure. Messages contain an example instead.
 PLACEHOLDER = "VALUE+/-SIGMA"
 _PRIOR_OF_TRANSLATION = "0.50+/-0.02"
 _PRIOR_OF_ROTATION = "90deg+/-2deg"
 
 _FIELDS = CalibratorConfig.by_name()
-# Arguments of extras that messages of the engine name, with their values.
+# Arguments of extras that appear in messages of the engine, with their values.
 _CHOICES = {"ground": ("auto", "off"), "setup": ("hand", "beside")}
 
-# Candidates for an option in a message, with a possible value: a word in backticks; a word with a
-# dot or an underscore, such as max_gap and prior.z; and scale, ground and setup before a value.
-# Words in a path, after a dash or in quotes are no candidates.
+# Possible options in a message, with a possible value: a word in backticks; a word with a dot or an
+# underscore, such as max_gap and prior.z; scale, ground and setup before a value. Words in a path,
+# after a dash or in quotes do not count.
 _OPTION_IN_TEXT = re.compile(
     r"(?:`(?P<quoted>[\w.]+)`|(?<![\w./\\='-])(?P<name>[a-z]+\d?(?:[._]+[a-z]+)+|"
     r"scale(?= (?:none|auto|estimate\b|\d))|ground(?= (?:auto|off)\b)|setup(?= (?:hand|beside)\b)))"
@@ -49,7 +50,7 @@ _PLAIN_PRIOR = re.compile(r"(-?[\d.]+)\+/-([\d.]+)")
 def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
     """Return a message of the engine with its options in the spelling of an interface.
 
-    ``others`` are names of further options of the interface that messages contain.
+    ``others`` has the names of further options of the interface in messages.
     """
 
     def option(match: re.Match[str]) -> str:
@@ -73,7 +74,7 @@ def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
 def spelled_options(options: Pairs, interface: Interface) -> str:
     """Return pairs of public option name and value in the spelling of an interface.
 
-    An example replaces the value of a prior that the user has to measure.
+    If the user must measure a prior, an example replaces its value.
     """
     options = [(name, _example_of(name, value)) for name, value in options]
     if interface is Interface.TERMINAL:
@@ -98,9 +99,9 @@ def spelled_options(options: Pairs, interface: Interface) -> str:
 def with_options(
     advice: str, options: Mapping[str, object], interface: Interface
 ) -> str:
-    """Return an advice with the options that it needs, in the spelling of an interface.
+    """Return advice with the options that it needs, in the spelling of an interface.
 
-    Options that the advice contains are not repeated.
+    Options that are already in the advice are not repeated.
     """
     text = spelled(advice, interface)
     ready, measured = {}, {}
@@ -117,7 +118,7 @@ def with_options(
 
 
 def _example_of(name: str, value: object) -> object:
-    """Return an example of a prior that the user has to measure; other values unchanged."""
+    """Return an example for a prior that the user must measure. Other values are unchanged."""
     if value != PLACEHOLDER:
         return value
     is_translation = name.rpartition(".")[2] in ("x", "y", "z")
@@ -125,7 +126,7 @@ def _example_of(name: str, value: object) -> object:
 
 
 def _is_value(name: str, text: str) -> bool:
-    """Return whether a word behind an option in a message is the value of the option."""
+    """Return whether a word after an option in a message is the value of the option."""
     if name not in _FIELDS:
         return name not in _CHOICES or text in _CHOICES[name]
     field = _FIELDS[name]
@@ -133,7 +134,7 @@ def _is_value(name: str, text: str) -> bool:
     if is_text and not any(
         field.metadata[form] for form in ("parse", "choices", "words")
     ):
-        # Any text may be the name of a frame.
+        # Any text can be the name of a frame.
         return False
     value: float | str = text
     with suppress(ValueError):
@@ -169,7 +170,7 @@ _DASHES = str.maketrans("._", "--")
 
 
 def _value_of_python(value: object) -> str:
-    """Return the Python notation of a value that may be the text of a number."""
+    """Return the Python notation of a value. Its type may be a text that contains a number."""
     with suppress(ValueError):
         return f"{float(str(value)):.12g}"
     return f'"{value}"' if isinstance(value, str) else str(value)

@@ -1,8 +1,8 @@
 """Quantiles and robust weights.
 
 Quantiles of data are computed here, because the functions of NumPy import ``numpy.ma``, which takes
-a tenth of the import time of NumPy. Quantiles of distributions are tables, because the import of
-SciPy's functions takes longer than a comparison of results.
+a tenth of the import time of NumPy. Quantiles of distributions are tables: the import of SciPy's
+functions takes longer than a comparison of results.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ MEDIAN_NORMAL = 0.6745
 # Median length of a standard normal vector in three dimensions.
 MEDIAN_LENGTH = 1.538
 
-# Quantiles of chi-square, by the probability of a larger value and by the degrees of freedom.
+# Quantiles of chi-square, by the probability of a larger value and the degrees of freedom.
 CHI2 = {
     0.5: {1: 0.455, 6: 5.348},
     0.01: {1: 6.63, 2: 9.21, 3: 11.34, 4: 13.28, 5: 15.09, 6: 16.81},
@@ -26,17 +26,17 @@ CHI2 = {
 # The largest absolute value of six standard normal variables exceeds this in one of 200 cases.
 LARGEST_OF_SIX = 3.341479
 
-# Standard normal quantile of 0.9. An estimate exceeds a limit in nine of ten cases if its expected
-# value is this number of standard deviations above the limit.
+# Quantile 0.9 of the standard normal distribution. An estimate exceeds a limit in nine of ten cases
+# if its expected value is this number of standard deviations above the limit.
 NINE_TIMES_OUT_OF_TEN = 1.281552
 
 # Degrees of freedom of Student's t distribution, as a model of heavy tails.
 STUDENT = 4.0
 
-# Singular values of a regression below this share of the largest one are rounding.
+# In a regression, singular values below this share of the largest one are rounding.
 _RANK_TOLERANCE = 1e-9
 
-# Smallest unit of residuals in a robust regression, for exact data.
+# Smallest unit of residuals in a robust regression. It is for exact data.
 _SMALLEST_UNIT = 1e-12
 
 
@@ -64,8 +64,8 @@ def medians(values: FloatArray) -> FloatArray:
 def quantile(values: ArrayLike, share: float) -> float:
     """Return the quantile of at least one finite value, for a probability from 0 to 1.
 
-    Values may have any shape. The quantile is interpolated linearly between two values, as in
-    ``numpy.quantile``, but in less time.
+    The values may have any shape. The quantile is interpolated linearly between two values, like
+    ``numpy.quantile``, but faster.
     """
     flat = np.asarray(values, dtype=np.float64).ravel()
     rank = share * (len(flat) - 1)
@@ -76,17 +76,18 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def robust_sigma(vectors: FloatArray) -> FloatArray:
-    """Return robust standard deviations (...) per axis of K vectors each (..., K, 3)."""
+    """Return robust standard deviations (...) per axis, each from K vectors (..., K, 3)."""
     lengths = np.linalg.norm(vectors, axis=-1)
     return medians(lengths) / MEDIAN_LENGTH
 
 
 def share_of_step(n_components: int) -> float:
-    """Return the share of a small change that one step with fixed Student weights estimates.
+    """Return the share of a small change that one step with fixed Student weights achieves.
 
-    Weights depend on the residuals: the score of a residual grows less than its weight times the
-    residual. ``n_components`` is the number of components of a residual. K. L. Lange, R. J. A.
-    Little, J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84, 1989.
+    The weight of a residual decreases with its size, so the score grows less than the fixed weight
+    times the residual. ``n_components`` is the number of components of a residual. K. L. Lange, R.
+    J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t distribution*, JASA 84,
+    1989.
     """
     return (STUDENT + n_components) / (STUDENT + n_components + 2.0)
 
@@ -94,7 +95,7 @@ def share_of_step(n_components: int) -> float:
 def student_weights(
     squared: FloatArray, degrees: float = STUDENT
 ) -> FloatArray:
-    """Return weights of vectors of six values for Student's t distribution; their mean is 1.
+    """Return weights by Student's t distribution for vectors of six values. Their mean is 1.
 
     K. L. Lange, R. J. A. Little, J. M. G. Taylor, *Robust statistical modeling using the t
     distribution*, JASA 84, 1989, eq. 4.
@@ -109,7 +110,7 @@ def student_weights(
     return (degrees + 6.0) / (degrees + squared)
 
 
-# Weight functions by kind. Their argument is the squared residual, see :func:`robust_weights`.
+# Weight functions by kind. Their argument is the squared residual; see :func:`robust_weights`.
 _WEIGHTS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     # P. J. Huber, *Robust estimation of a location parameter*, Ann. Math. Statist. 35, 1964.
     "huber": lambda squared: np.asarray(
@@ -131,11 +132,12 @@ def robust_weights(kind: str, squared: FloatArray) -> FloatArray:
     Parameters
     ----------
     kind : {"huber", "cauchy", "geman_mcclure", "student"}
-        Weight function. Weights are at most 1, except for ``student``: its weights have the mean 1
-        for vectors of six values.
+        Weight function. Weights are at most 1; only ``student`` differs: its weights have the mean
+        1 for vectors of six values.
     squared : (...) array
-        Squared residuals. At 1, the weight is 1/2 for ``cauchy`` and 1/4 for ``geman_mcclure``; the
-        weight of ``huber`` is 1 up to there. For ``student``, squared Mahalanobis distances.
+        Squared residuals. A squared residual of 1 has the weight 1/2 for ``cauchy``, 1/4 for
+        ``geman_mcclure``, and 1 for ``huber`` (also below 1). For ``student``: squared Mahalanobis
+        distances.
 
     Examples
     --------
@@ -163,8 +165,8 @@ def robust_regression(
     rounds : int
         Number of iterations.
     unit : callable
-        ``unit(lengths)`` returns the unit of residuals for the weight function, from the lengths
-        (K,) of all residuals.
+        Function ``unit(lengths)`` that returns the unit of residuals for the weight function, from
+        the lengths (K,) of all residuals.
 
     Returns
     -------
@@ -187,11 +189,11 @@ def robust_regression(
 
 
 def chi_square_quantile(tail: float) -> float:
-    """Return the value that chi-square with 6 degrees of freedom exceeds with probability ``tail``.
+    """Return the value that chi-square (6 degrees of freedom) exceeds with probability ``tail``.
 
-    ``tail`` is from 1e-30 to 0.99. Chi-square exceeds 2 h with the probability
-    ``exp(-h) (1 + h + h^2 / 2)``. The negative logarithm of this probability is convex and grows
-    with h. So Newton's method converges from above, in at most ten steps.
+    ``tail`` is between 1e-30 and 0.99. Chi-square exceeds 2 h with the probability ``exp(-h) (1 + h
+    + h^2 / 2)``. The negative logarithm of this probability is convex and increases with h. So
+    Newton's method converges from above, in at most ten steps.
     """
     half = 10.0 - 2.0 * np.log(tail)
     for _ in range(20):

@@ -12,21 +12,21 @@ from typing import TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
 
-# Units of lengths: largest length (m) that has this unit, unit, factor from metres.
+# Units of length: the largest length (m) for the unit, the unit, and the factor from metres.
 _LENGTHS = ((0.00995, "mm", 1000), (0.995, "cm", 100), (math.inf, "m", 1))
 
-# Units of durations: longest duration (s) that has this unit, unit, divisor of seconds.
+# Units of duration: the longest duration (s) for the unit, the unit, and the divisor of seconds.
 _DURATIONS = ((90.0, "s", 1), (5_400.0, "min", 60), (math.inf, "h", 3600))
 
 # Largest number of decimals in a text.
 _MAX_DECIMALS = 6
 
-#: Axis of rotation, by the name of the angle.
+#: Axis about which each angle rotates.
 ABOUT = {"roll": "x", "pitch": "y", "yaw": "z"}
 
 
 def length(metres: float) -> str:
-    """Format a length with two digits in mm, cm or m; a length above 10 m with up to four."""
+    """Format a length with two digits in mm, cm or m, and with up to four above 10 m."""
     size = abs(metres)
     if size >= 10:
         return f"{metres:,.{1 if size < 100 else 0}f} m"
@@ -37,7 +37,7 @@ def length(metres: float) -> str:
 def _suitable_unit(
     size: float, units: Iterable[tuple[float, str, int]]
 ) -> tuple[str, int]:
-    """Return the name and factor of the first unit that is suitable for a size."""
+    """Return name and factor of the first suitable unit for a size."""
     return next(
         (name, factor) for largest, name, factor in units if not size > largest
     )
@@ -49,14 +49,14 @@ def angle(radians: float) -> str:
 
 
 def amount(axis: str, value: float) -> str:
-    """Format a length (m) for x, y or z, else an angle (rad); "unknown" if it is not finite."""
+    """Format a length (m) of x, y or z, or an angle (rad); "unknown" if it is not finite."""
     if not math.isfinite(value):
         return "unknown"
     return length(value) if axis in ("x", "y", "z") else angle(value)
 
 
 def amount_beside(axis: str, value: float, other: float) -> str:
-    """Format an amount like :func:`amount`, with more digits if needed to differ from ``other``."""
+    """Format an amount like :func:`amount`, with the digits needed to differ from ``other``."""
     text = amount(axis, value)
     if (
         text != amount(axis, other)
@@ -95,7 +95,7 @@ def capital(text: str) -> str:
 
 
 def in_sentences(message: str) -> str:
-    """Return a message of one line as sentences, which end where it has a colon or semicolon."""
+    """Return a one-line message as sentences, divided at its colons or semicolons."""
     parts = re.split("[:;] ", message)
     return " ".join(f"{capital(part)}." for part in parts)
 
@@ -111,7 +111,7 @@ def axes_in_words(axes: Sequence[str]) -> str:
 
 
 def two_digits(value: float) -> str:
-    """Format a number with two significant digits, or all digits before the decimal point.
+    """Format a number with two significant digits, and all digits before the decimal point.
 
     Trailing zeros of the decimals are left out.
     """
@@ -125,7 +125,7 @@ def two_digits(value: float) -> str:
 def with_sigma(
     value: float | None, sigma: float | None, min_decimals: int = 2
 ) -> str:
-    """Format a number with its standard deviation; "unknown" if a number is None or sigma infinite.
+    """Format a number with its standard deviation; "unknown" without a number or a finite sigma.
 
     The standard deviation has two significant digits. Value and standard deviation have the same
     number of decimals, at least ``min_decimals``.
@@ -141,7 +141,7 @@ def with_sigma(
 
 def fixed(value: float, decimals: int = 4) -> str:
     """Format a number with a fixed number of decimals, without a minus sign before zero."""
-    # The sum turns -0.0 into 0.0.
+    # Rounding may produce -0.0. Adding 0.0 changes it to 0.0.
     rounded = round(value, decimals) + 0.0
     return f"{rounded:.{decimals}f}"
 
@@ -160,7 +160,7 @@ def in_words(value: object) -> str:
 
 
 def given_or_estimated(value: float, sigma: float, unit: str) -> str:
-    """Format a number that the user has set (``sigma`` is 0), or that was estimated."""
+    """Format a number that was set by the user (``sigma`` is 0) or estimated."""
     if not sigma:
         return f"{value:g} {unit}".strip()
     number = f"{with_sigma(value, sigma, 4)} {unit}".strip()
@@ -180,12 +180,12 @@ def share(value: float) -> str:
     return f"{value:.{decimals}%}"
 
 
-# Share of null poses in all messages above which the user is asked to check their source.
+# If more than this share of all messages has null poses, the user is asked to check their source.
 MUCH_NULL = 0.1
 
 
 def without_poses(n_null: int, n_all: int) -> str:
-    """Return a message about null poses that were skipped, with advice if there are many."""
+    """Return a message about skipped null poses, with advice if there are many."""
     counts = (
         f"{n_null:,} of {n_all:,} poses ({share(n_null / n_all)}) were left out"
     )
@@ -205,7 +205,7 @@ def listing(words: Sequence[str]) -> str:
 
 
 def distinct_names(paths: Sequence[str]) -> list[str]:
-    """Return short names: paths without the leading and trailing parts that all paths share.
+    """Return short names: paths without the first and last parts that all paths share.
 
     For a/monday/bag and a/tuesday/bag, the names are monday and tuesday.
     """
@@ -219,13 +219,13 @@ def distinct_names(paths: Sequence[str]) -> list[str]:
 
 
 def _n_shared(paths: Sequence[Sequence[str]]) -> int:
-    """Return the number of leading parts that all paths share."""
+    """Return the number of first parts that all paths share."""
     levels = zip(*paths, strict=False)
     return sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, levels))
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a count with its noun, to which an s is appended for the plural."""
+    """Return a count with its noun. The plural gets an s."""
     plural = "" if count == 1 else "s"
     return f"{count:,} {noun}{plural}"
 
@@ -248,15 +248,15 @@ _QUANTITY = re.compile(
     r"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)(m|cm|mm|rad|deg)?"
 )
 
-# Largest length (m) or angle (rad) that a user may type, so that squares do not overflow.
+# Largest length (m) or angle (rad) that a user may type. Squares of larger numbers could overflow.
 _MAX_TYPED = 1e6
 
-# Longest length (m) of a prior without a unit. Sensors are rarely farther apart: 22 without a unit
-# probably means centimetres.
+# Longest length (m) of a prior without a unit. Sensors are rarely farther apart; 22 without a unit
+# is probably in centimetres.
 _MAX_WITHOUT_UNIT_M = 5.0
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
-# pitch, yaw (rad): value and standard deviation, or both as the text of the option ``prior.AXIS``.
+# pitch, yaw (rad): value and standard deviation, or the text of the option ``prior.AXIS``.
 Prior: TypeAlias = Mapping[str, tuple[float, float] | str]
 
 
@@ -278,9 +278,9 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     Raises
     ------
     ConfigError
-        If the text has another form, an unknown unit or a standard deviation of 0; if a value of
-        more than 5 m has no unit; or if the value has a unit other than m or rad, and the standard
-        deviation has none.
+        If the text has another form, an unknown unit or a standard deviation of 0. If a value above
+        5 m has no unit. If the value has a unit other than m or rad, and the standard deviation has
+        no unit.
     """
     in_one_notation = text.replace("±", "+/-").replace("+-", "+/-")
     value, _, sigma = in_one_notation.partition("+/-")
@@ -314,14 +314,14 @@ def _unit_of(word: str) -> str:
 
 
 def _with_units(words: Iterable[str], unit: str) -> list[str]:
-    """Return the quantities with ``unit`` appended to those that have none."""
+    """Return the quantities; those without a unit get ``unit``."""
     return [word if _unit_of(word) else f"{word}{unit}" for word in words]
 
 
 def prior_as_typed(axis: str, value: str, sigma: str) -> str:
     """Return the text of the option ``prior.AXIS`` for numbers typed into fields in m or deg.
 
-    No unit is added to a length of more than 5 m, so that the option asks for a unit.
+    A length above 5 m gets no unit, so that the option requests it.
     """
     words = [word.strip().replace(",", ".") for word in (value, sigma)]
     if AXIS_UNITS[axis] == "rad":
@@ -347,7 +347,7 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:
-    """Return the targets of single axes: name of the axis to standard deviation in m or rad.
+    """Return the targets of single axes: axis name to standard deviation (m or rad).
 
     The text is like ``z=10cm yaw=0.5deg``. Numbers without a unit are in metres or radians.
 
@@ -381,20 +381,20 @@ def quantities(
     form: str,
     above: float = -math.inf,
 ) -> list[float]:
-    """Return the numbers of words, each converted to its unit (m or rad).
+    """Return the numbers in words, each converted to its unit (m or rad).
 
     Parameters
     ----------
     name : str
         Name of the option, for messages.
     units : sequence of {"m", "rad"}
-        Unit of each result, which is also that of a word without unit.
+        Unit of each result. A word without a unit has this unit.
     words : sequence of str
         Numbers, with or without units such as cm or deg.
     form : str
         Expected form of the text, for messages.
     above : float
-        Lower bound that is not allowed itself.
+        Lower bound (exclusive).
 
     Raises
     ------
@@ -462,7 +462,7 @@ def frame_name(name: str) -> str:
 
 
 def split_frames(name: str, text: str) -> tuple[str, str]:
-    """Return the fixed frame and the sensor's frame in ``WORLD:SENSOR``, the value of an option.
+    """Return the fixed frame and the sensor's frame from ``WORLD:SENSOR``, the value of an option.
 
     Raises
     ------

@@ -24,8 +24,8 @@ STREAM_REPAIRS = (
     ),
 )
 
-# A noise model fits if its misfit, the weighted squared residual per degree of freedom, is at most
-# this. The misfit is 1 if the model is right, and less if there is no noise.
+# A noise model fits if its misfit (weighted squared residual per degree of freedom) is at most
+# this. The misfit is 1 for the right model, and smaller without noise.
 _MAX_MISFIT = 2.0
 
 # Growth of a sigma by open faults above which a result is examined again.
@@ -40,8 +40,8 @@ class OptionMessage(NamedTuple):
     text : str
         Message with the estimates of the result.
     lasting : str
-        Message without estimates and verdict. A live session keeps it, because later results with
-        the same options have other estimates.
+        Message without estimates and verdict, for a live session: later results with the same
+        options have other estimates.
     """
 
     text: str
@@ -61,7 +61,7 @@ class Attempt:
     check : CheckResult
         Check of the streams with the result.
     options : mapping
-        Options that were set automatically, because a check is certain of them: name to value.
+        Options that were set automatically because a check is certain of them: name to value.
     messages : tuple of OptionMessage
         Messages about these options and the reason. They are the first warnings of the calibration.
     """
@@ -81,7 +81,7 @@ class Attempt:
 
     @property
     def n_objections(self) -> int:
-        """Number of findings graver than a note."""
+        """Number of findings that are graver than a note."""
         return sum(
             finding.severity is not Severity.NOTE
             for finding in self.check.findings
@@ -101,8 +101,8 @@ class Attempt:
     def is_better_than(self, other: "Attempt", n_fewer: int) -> bool:
         """Return whether this attempt is better than another one.
 
-        This attempt is better if it is usable and the other is not. It is also better if it has at
-        least ``n_fewer`` objections fewer, unless only the other fits its noise model.
+        It is better if it is usable and the other attempt is not. It is also better if it has fewer
+        objections by at least ``n_fewer``, unless only the other attempt fits its noise model.
         """
         if self.is_usable and not other.is_usable:
             return True
@@ -112,7 +112,7 @@ class Attempt:
     def with_findings(self, findings: Collection[Finding]) -> "Attempt":
         """Return the attempt with other findings.
 
-        An open choice between poses and inverse poses is dropped.
+        If both readings (poses or inverse poses) were possible, the result no longer contains this.
         """
         sorted_findings = gravest_first(tuple(findings))
         return replace(
@@ -144,7 +144,7 @@ class Attempt:
         )
 
     def for_session(self) -> Calibration:
-        """Return the result with lasting messages in place of messages with estimates."""
+        """Return the result with lasting messages instead of messages with estimates."""
         texts = [message.text for message in self.messages]
         lasting = [message.lasting for message in self.messages]
         others = [
@@ -165,10 +165,10 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
         return replace(snapshot, config=config)
     if not len(snapshot.kept):
         return replace(snapshot, config=config, time_offset=None)
-    # The new snapshot repairs its streams itself, so its buffers must have streams without repairs.
+    # The new snapshot applies the repairs itself, so its buffers must have the original streams.
     without_repairs = replace(snapshot.config, **defaults_of(STREAM_REPAIRS))
     parent, child = replace(snapshot, config=without_repairs).streams
-    # The kept pairs have larger gaps than the streams. So max_gap is that of the first pairing.
+    # Kept pairs have larger gaps than the streams, so max_gap is that of the first pairing.
     return replace(
         snapshot,
         config=replace(config, max_gap=snapshot.max_gap_s),

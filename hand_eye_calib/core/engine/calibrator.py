@@ -1,4 +1,4 @@
-"""Calibrator, which collects the poses of two streams while they arrive, and pairs them.
+"""Calibrator: it collects the poses of two streams as they arrive, and pairs them.
 
 The node, the replay of bags and the Python API use it.
 """
@@ -33,19 +33,19 @@ class BufferLimits:
     Attributes
     ----------
     capacity : int
-        Largest number of poses in a buffer. A buffer fills up if the other stream is delayed, or if
-        the time offset is not estimated yet. The oldest poses of a full buffer are paired; if this
-        is not possible, half of its poses are dropped.
+        Largest number of poses in a buffer. A buffer is filled if the other stream is delayed, or
+        before the time offset is estimated. If it is full, its oldest poses are paired. If this is
+        impossible, half of its poses are dropped.
     pairing_starts : int
-        Number of buffered poses above which the oldest ones are paired: 20 s at 100 Hz. Poses in
+        The oldest poses are paired if more poses than this are buffered: 20 s at 100 Hz. Poses in
         the buffer may arrive in any order.
     batch : int
-        Largest number of poses that are paired at once. Small batches limit the time to add one
+        Largest number of poses that are paired together. Small batches limit the time of adding a
         pose to a few milliseconds.
     batch_every : int
         Number of new poses between two batches.
     late_ns : int
-        Poses closer than this to the newest pose of their stream are not paired yet, because
+        Poses within this time of the newest pose of their stream are not paired yet, because
         earlier poses may still arrive.
     """
 
@@ -69,7 +69,8 @@ class StreamStatistics:
     refused_late : int
         Number of poses that were refused because later poses were paired already.
     dropped_unpaired : int
-        Number of accepted poses that were dropped because the other stream had no poses then.
+        Number of accepted poses that were dropped because the other stream had no poses at that
+        time.
     first_stamp_ns, last_stamp_ns : int or None
         Smallest and largest accepted stamp; None before the first pose.
     """
@@ -93,7 +94,7 @@ class _PoseBuffer:
     """
 
     def __init__(self) -> None:
-        # Python's arrays append single poses as fast as lists do, and NumPy copies whole arrays.
+        # Python's arrays append single poses as fast as lists, and NumPy can copy whole arrays.
         self.stamps_ns = array("q")
         self._poses = array("d")
         self._dropped_until_ns = -(2**63)
@@ -105,7 +106,7 @@ class _PoseBuffer:
         return len(self.stamps_ns)
 
     def add(self, stamp_ns: int, pose: tuple[float, ...]) -> bool:
-        """Insert a pose (x y z qx qy qz qw); return False if its stamp is a duplicate or late."""
+        """Insert a pose (x y z qx qy qz qw). Return False if its stamp is a duplicate or late."""
         counts = self.statistics
         index = bisect_left(self.stamps_ns, stamp_ns)
         if stamp_ns <= self._dropped_until_ns:
@@ -124,11 +125,11 @@ class _PoseBuffer:
         return True
 
     def stamp_of(self, index: int) -> int:
-        """Return the stamp (ns) of a pose; that of the newest pose if the index is too large."""
+        """Return the stamp (ns) of a pose; the newest stamp if the index is too large."""
         return self.stamps_ns[min(index, len(self) - 1)]
 
     def trajectory(self, until_ns: int = 2**63) -> Trajectory:
-        """Return the poses up to a stamp, and a few more that interpolation needs."""
+        """Return the poses up to a stamp, and the few later poses that interpolation needs."""
         end = bisect_right(self.stamps_ns, until_ns) + REACH
         values = np.array(self._poses[: _WIDTH * end])
         poses = values.reshape(-1, _WIDTH)
@@ -136,9 +137,9 @@ class _PoseBuffer:
         return Trajectory.from_quat_xyzw(stamps_ns, poses[:, :3], poses[:, 3:])
 
     def drop(self, until_ns: int, unpaired: bool) -> None:
-        """Drop the poses up to a stamp, except the last few, which interpolation needs.
+        """Drop the poses up to a stamp, except the last few for interpolation.
 
-        Poses up to this stamp are refused from now on. If ``unpaired``, the statistics count the
+        Poses up to this stamp are refused afterwards. With ``unpaired``, the statistics count the
         poses as dropped.
         """
         split = max(bisect_right(self.stamps_ns, until_ns) - REACH, 0)
@@ -152,9 +153,9 @@ class Calibrator:
     """Collect the poses of both streams and estimate T_parent_child from them.
 
     Poses may arrive at any rate and in any order. They are paired at the stamps of the slower
-    stream. The poses of the other stream are interpolated along the geodesic of SE(3), neither
-    outside of the stream nor in gaps longer than ``max_gap``. Memory is bounded: one buffer for
-    each stream, and at most ``max_pairs`` pose pairs.
+    stream. The poses of the other stream are interpolated along the geodesic of SE(3), but not
+    outside of the stream, and not in gaps longer than ``max_gap``. Memory is bounded: one buffer
+    per stream, and at most ``max_pairs`` pose pairs.
 
     Parameters
     ----------
@@ -190,7 +191,7 @@ class Calibrator:
         self._proposed_offset: TimeOffset | None = None
 
     def reconfigure(self, config: CalibratorConfig) -> None:
-        """Set other options. Poses are kept; pairs are dropped if the time offset changes."""
+        """Set other options. Poses are kept. If the time offset changes, pairs are dropped."""
         if config.time_offset != self.config.time_offset:
             self._drop_pairs()
         self.config = config
@@ -215,7 +216,7 @@ class Calibrator:
         return replace(self._buffers[stream].statistics)
 
     def frame(self, stream: str) -> str:
-        """Return the name of a stream's sensor frame in messages; empty before the first one."""
+        """Return the name of a stream's sensor frame in messages; empty before the first."""
         return self._buffers[stream].frame
 
     def set_frame(self, stream: str, sensor_frame: str) -> None:
@@ -273,7 +274,7 @@ class Calibrator:
         Returns
         -------
         bool
-            False if the pose was refused because its stamp is a duplicate or too late.
+            False if the pose was refused, because its stamp is a duplicate or too late.
             :meth:`statistics` counts refused poses.
 
         Raises
@@ -286,7 +287,7 @@ class Calibrator:
             <= trajectory.QUATERNION_NORM_TOLERANCE
         )
         if not (is_unit and math.hypot(*position) <= trajectory.FARTHEST_M):
-            # Raise InputError with the reason.
+            # This raises an InputError with the reason.
             check_pose(*position, *quat_xyzw)
         buffer = self._buffers[stream]
         limits = self._limits
@@ -295,7 +296,8 @@ class Calibrator:
         if is_full or (is_due and len(buffer) > limits.pairing_starts):
             self._make_pairs(is_full)
         if len(buffer) >= limits.capacity:
-            # The older half cannot be paired, because the other stream has no poses at these times.
+            # The other stream has no poses at the times of the older half, so these poses cannot be
+            # paired.
             buffer.drop(buffer.stamp_of(len(buffer) // 2), unpaired=True)
         return buffer.add(int(stamp_ns), (*position, *quat_xyzw))
 
@@ -322,8 +324,8 @@ class Calibrator:
     def take_pairs(self) -> PosePairs:
         """Return the pose pairs made so far, and drop all of them except the last pair.
 
-        The last pair is kept because new pairs must have later stamps. The next call returns it
-        again.
+        New pairs must have later stamps than the last pair, so it is kept, and returned again by
+        the next call.
         """
         pairs = self._kept
         self._kept_parts = [pairs[-1:]]
@@ -344,7 +346,7 @@ class Calibrator:
         """Pair the oldest poses, at most one batch, and drop them from the buffers.
 
         Poses are paired only if no earlier poses are expected, see ``BufferLimits.late_ns``. If the
-        time offset is an estimate, it is made when a buffer is full.
+        time offset must be estimated, this happens when a buffer is full.
         """
         parent = self._buffers["parent"]
         child = self._buffers["child"]
@@ -391,7 +393,7 @@ class Calibrator:
         child.drop(horizon_ns - offset_ns, unpaired=is_alone)
 
     def _estimated_offset(self) -> TimeOffset | None:
-        """Return the adopted time offset, or that of the buffered poses if they determine it."""
+        """Return the adopted time offset, or an estimate from the buffered poses if possible."""
         if self._proposed_offset:
             return self._proposed_offset
         parent = self._buffers["parent"].trajectory()
@@ -409,7 +411,7 @@ class Calibrator:
     @property
     def _kept(self) -> PosePairs:
         """All pose pairs made so far."""
-        # Batches are concatenated only when all pairs are needed.
+        # Concatenate the batches only when all pairs are needed.
         if len(self._kept_parts) > 1:
             self._kept_parts = [PosePairs.concatenate(*self._kept_parts)]
         return self._kept_parts[0]
@@ -422,9 +424,9 @@ class Calibrators(dict[str, Calibrator]):
     """
 
     def takers(self, stream: str) -> list[tuple[str, Calibrator]]:
-        """Return the calibrators that use a stream, each with its own name for this stream.
+        """Return the calibrators that use a stream, with their own names for this stream.
 
-        All calibrators use the stream "parent". Each child stream is called "child" in its own
+        All calibrators use the stream "parent". A child stream has the name "child" in its own
         calibrator.
         """
         if stream == "parent":

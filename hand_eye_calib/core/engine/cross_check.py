@@ -1,10 +1,10 @@
 """Comparison of a result with other estimates of the same transform.
 
-The other estimates come from robust least squares. Some use motions over several strides (numbers
-of poses), the others use each half of the recording. The scatter of the estimates about the result
-is compared with the covariances. Motions over other strides reveal errors that the noise model does
-not contain, such as errors with longer correlation times. The halves reveal changes during the
-recording. Constant errors remain hidden.
+The other estimates come from robust least squares: from motions over several strides (numbers of
+poses), and from each half of the recording. The scatter of the estimates about the result is
+compared with the covariances. Other strides reveal errors that the noise model does not contain,
+such as errors with longer correlation times. The halves reveal changes during the recording.
+Constant errors remain hidden.
 """
 
 import math
@@ -28,28 +28,29 @@ from hand_eye_calib.core.results.calibration import Calibration, DofVerdict
 from hand_eye_calib.core.results.records import AXES, AxisScatter, CrossCheck
 from hand_eye_calib.core.solvers import robust
 
-# Reference of the motions in a half if the result has no reference.
+# Reference of the motions in each half, if the result has no reference.
 _REFERENCE_OF_HALVES = "B8"
 
-# Largest number of motion pairs that are used of a half.
+# Largest number of motion pairs that are used from a half.
 _MAX_PAIRS = 3_000
 
-# Smallest number of poses of a half for an estimate.
+# Smallest number of poses in a half for an estimate.
 _MIN_POSES = 20
 
-# Smallest number of other estimates for a robust standard deviation of their scatter.
+# Smallest number of other estimates from which a robust standard deviation is computed.
 _MIN_OTHERS = 3
 
-# Another estimate is about as certain as the result if its standard deviation is below this
-# multiple of that of the result.
+# Another estimate counts as about equally certain if its standard deviation is below this multiple
+# of the standard deviation of the result.
 _AS_CERTAIN = 3.0
 
-# Smallest number of estimates that are about as certain, for a robust standard deviation.
+# Smallest number of about equally certain estimates from which a robust standard deviation is
+# computed.
 _MIN_AS_CERTAIN = 2
 
-# Halves are not compared on an axis if their standard deviations differ by more than this factor:
-# the smaller one is then an effect of noise. The factor is 12 to 47 for simulated straight starts
-# of 40 s, and 1.1 to 4.0 with curves in both halves.
+# Halves are not compared on an axis if their standard deviations differ by more than this factor,
+# because noise then causes the smaller one. The factor is 12 to 47 for simulated straight starts of
+# 40 s, and 1.1 to 4.0 with curves in both halves.
 _MAX_RATIO_OF_HALVES = 5.0
 
 # Smallest standard deviation (m, rad) used as a divisor, for noise-free data.
@@ -61,8 +62,8 @@ def cross_checked(
 ) -> Calibration:
     """Return the result of a solve with its cross-check.
 
-    If only the result determines an axis, and no other estimate does, the verdict of this axis
-    becomes weak. If there is a prior on this axis, it replaces the estimate from motion.
+    If only the result determines an axis, and no other estimate does, the axis becomes weak. With a
+    prior on this axis, the prior replaces the estimate from motion.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def cross_checked(
     config : CalibratorConfig
         Options of the solve.
     pose_pairs : PosePairs
-        Poses of the solve: on one clock, each stream in its own unit of length.
+        Poses of the solve: on one clock, but each stream in its own unit of length.
     """
     result = solved.calibration()
     others = solved.opinions or answers_of_whole(result, pose_pairs)
@@ -85,8 +86,8 @@ def cross_checked(
             dof = replace(dof, verdict=DofVerdict.WEAK)
         observability.append(dof)
     # The covariance of the result already contains the excess scatter of the other estimates, so
-    # that no other estimate could contradict the result. The comparison uses the covariance of the
-    # noise model without the excess.
+    # they could never contradict it. Compare with the covariance of the noise model, without the
+    # excess.
     of_model = replace(solved, excess=np.zeros((6, 6))).calibration(replaced)
     return replace(
         result,
@@ -98,7 +99,7 @@ def cross_checked(
 def _unconfirmed(
     result: Calibration, others: Sequence[Assessment]
 ) -> BoolArray:
-    """Return a mask (6,) of the axes that the result determines and no other estimate does."""
+    """Return a mask (6,) of the axes that only the result determines."""
     # A result with a reference uses the most informative motions. Other motions may determine fewer
     # axes.
     if len(others) < _MIN_OTHERS or METHODS[result.method].uses_reference:
@@ -112,7 +113,7 @@ def _unconfirmed(
 def answers_of_whole(
     result: Calibration, pose_pairs: PosePairs
 ) -> tuple[Assessment, ...]:
-    """Estimate X from the motions of each of several strides, with the scale of the result.
+    """Estimate X for several strides, with the scale of the result.
 
     A stride is the number of poses from the start to the end of a motion.
     """
@@ -127,7 +128,7 @@ def answers_of_halves(
 ) -> list[Assessment]:
     """Estimate X from each half of the recording that has enough poses.
 
-    The estimates use the scale of the result, and the reference of the result if it has one.
+    The scale is that of the result. The reference is also that of the result, if it has one.
     """
     scaled = pose_pairs.child_scaled(result.scale)
     middle = len(scaled) // 2
@@ -160,8 +161,7 @@ def compare_answers(
     others : sequence of Assessment
         Estimates from the whole recording.
     halves : sequence of Assessment
-        Estimates from the first and the second half of the recording. They are ignored unless there
-        are two.
+        Estimates from the first and the second half of the recording. A single estimate is ignored.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def compare_answers(
         )
     own_sigmas = np.maximum(sigmas, _ROUNDING)
     of_others = np.reshape([other.sigmas for other in others], (-1, 6))
-    # Only estimates that are about as certain as the result.
+    # Use only estimates that are about as certain as the result.
     is_certain = of_others < _AS_CERTAIN * own_sigmas
     differences_of_certain = np.where(is_certain, differences, np.nan)
     scatter_of_certain = _robust_sigma(differences_of_certain, _MIN_AS_CERTAIN)
@@ -216,7 +216,7 @@ def _scatter_of_halves(
     (6,) array
         Standard deviations (m, rad); NaN for axes that are not compared.
     (6,) array
-        Ratios of these standard deviations to those that the covariances predict.
+        These standard deviations, divided by those that the covariances predict.
     """
     if len(halves) != 2:
         return np.full(6, np.nan), np.full(6, np.nan)
@@ -229,9 +229,9 @@ def _scatter_of_halves(
         axis=0
     ) < _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
     between = np.where(are_alike, between, np.nan)
-    # The result is about the mean of both halves, whose standard deviation is half of that of the
-    # difference. The covariances of the halves lack the allowance. If the result comes from a noise
-    # model, they also lack its slow errors, which the sigma of the result contains.
+    # The result is about the mean of both halves. So its standard deviation is half of that of
+    # their difference. The covariances of the halves lack the allowance. The sigma of a noise model
+    # also contains slow errors, which they lack.
     has_slow_errors = not METHODS[calibration.method].uses_reference
     missing = calibration.sigmas if has_slow_errors else calibration.allowance
     return between / 2, between / 2 / np.hypot(joint / 2, missing)
@@ -242,8 +242,8 @@ def _distance_and_sigma(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the distance (6,) of another estimate, and the joint standard deviation (6,).
 
-    Distances and standard deviations (m, rad) are NaN on axes that the result or the other estimate
-    does not determine.
+    Distances and standard deviations (m, rad) are NaN on axes that one of both estimates does not
+    determine.
     """
     distance = np.abs(deviation(T_parent_child, other.T_parent_child))
     joint = np.hypot(sigmas, other.sigmas)

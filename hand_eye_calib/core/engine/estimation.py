@@ -49,8 +49,8 @@ from hand_eye_calib.core.results.records import Residuals
 from hand_eye_calib.core.solvers.all_pairs import Solution
 from hand_eye_calib.core.solvers.registry import Method
 
-# Share of jumps among the increments above which there is a warning. If a tenth of the poses of
-# each trajectory jumps, a fifth of the increments are jumps.
+# Share of jumps among the increments that causes a warning. If a tenth of the poses of each
+# trajectory jumps, a fifth of the increments are jumps.
 _MAX_JUMP_SHARE = 0.25
 
 
@@ -72,19 +72,19 @@ class Solved:
     measured : str
         Kind of data.
     pairs : MotionPairs
-        Motion pairs whose residuals are part of the result.
+        Motion pairs whose residuals are in the result.
     weights : (K,) array
         Weights of the motion pairs.
     stamps_ns : (N,) int64 array
         Stamps of the poses.
     config : CalibratorConfig
     method_reason, reference_reason : str
-        Reasons why ``auto`` chose the method and the reference.
+        Reasons for which ``auto`` chose the method and the reference.
     proved_global : str
         Whether the minimum is proved to be global: "yes", "no" or "not tried".
     warnings : tuple of str
     spread : (6, 6) array
-        Covariance due to a possible shift of the mount during the recording; zero if there is none.
+        Covariance by a possible shift of the mount during the recording; zero if there was none.
     scale : float
         Factor by which the child's lengths were multiplied.
     scale_fit : SimilarityFit or None
@@ -92,7 +92,7 @@ class Solved:
     time_offset : TimeOffset or None
         Time offset, if it was estimated.
     floor : (6, 6) array
-        Covariance of constant errors that both sensors have in common: the allowance.
+        Covariance of constant errors that both sensors have in common, which is the allowance.
     opinions : tuple of Assessment
         Second opinions: estimates by robust least squares, which test the solution.
     excess : (6, 6) array
@@ -121,7 +121,7 @@ class Solved:
     excess: FloatArray = field(default_factory=_zero_covariance)
 
     def calibration(self, unseen: Collection[str] = ()) -> Calibration:
-        """Return the result, without frame names. The axes in ``unseen`` become unobservable."""
+        """Return the result without frame names. The axes in ``unseen`` become unobservable."""
         config = self.config
         solution = self.solution
         assessment = self.assessment
@@ -231,15 +231,15 @@ def calibration_of(
     Parameters
     ----------
     solution : object
-        Any object with the attributes ``converged`` and ``objective``.
+        Object with the attributes ``converged`` and ``objective``.
     fused : Assessment
-        Assessment of the solution, fused with the prior.
+        Assessment of the solution, combined with the prior.
     residuals : Residuals
     stamps_ns : (N,) int64 array
         Stamps of the poses.
     config : CalibratorConfig
     warnings : tuple of str
-        Warnings. A warning about axes that are mostly from the prior precedes them.
+        Warnings. If axes are mostly from the prior, a warning about these axes is put first.
     **fields
         Further fields of the Calibration. They replace the defaults.
     """
@@ -285,7 +285,7 @@ def solve_poses(
     ----------
     pose_pairs : PosePairs
     config : CalibratorConfig
-        Options. Their time offset is in seconds, and was applied to the poses.
+        Options. Their time offset is a number (s) that was already applied to the poses.
     time_offset : TimeOffset, optional
         The same time offset with its uncertainty, if it was estimated.
 
@@ -335,13 +335,13 @@ def _spread_of_scale_and_offset(
     scale_fit: SimilarityFit | None,
     time_offset: TimeOffset | None,
 ) -> FloatArray:
-    """Covariance (6, 6) of the result by the uncertainty of an estimated scale and time offset."""
+    """Return the covariance (6, 6) of the result by an estimated scale and time offset."""
     spread = _zero_covariance()
     if scale_fit:
         by_log_scale = scale_fit.sensitivity[:, 0]
         relative_sigma = scale_fit.scale_sigma / scale_fit.scale
         spread += np.outer(by_log_scale, by_log_scale) * relative_sigma**2
-    # If the noise model estimates the time offset, its covariance contains the uncertainty already.
+    # If the noise model estimates the time offset, its covariance already contains the uncertainty.
     has_offset = (
         isinstance(solution, AdaptiveSolution) and solution.time_offset_s
     )
@@ -354,8 +354,8 @@ def _spread_of_scale_and_offset(
 def floor_of(
     solved: Solved, pose_pairs: PosePairs, config: CalibratorConfig
 ) -> FloatArray:
-    """Return the covariance (6, 6) of constant errors of the sensors that are odometries."""
-    # The functions in `common_mode` return the covariance for two odometries.
+    """Return the covariance (6, 6) of constant errors of those sensors that are odometries."""
+    # The functions in `common_mode` are for two odometries.
     share = [config.parent_kind, config.child_kind].count("odometry") / 2
     speed_m_s = common_mode.usual_speed(
         pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p)
@@ -373,8 +373,8 @@ def _solve_stream(
 ) -> Solved:
     """Solve with the adaptive estimator.
 
-    Method ``auto`` uses DNLO instead if the noise model does not fit these poses, or if the user
-    set a reference, which the adaptive estimator does not use.
+    Method ``auto`` uses DNLO instead in two cases: the noise model does not fit these poses, or the
+    user set a reference, which the adaptive estimator does not use.
     """
     is_auto = config.method == "auto"
     with_dnlo = replace(config, method="dnlo")
@@ -385,7 +385,7 @@ def _solve_stream(
         return replace(
             _solve_pairs(pose_pairs, with_dnlo), method_reason=reason
         )
-    # The noise model does not estimate a scale or a time offset that the user set to a number. It
+    # If the user set a scale or time offset to a number, the noise model does not estimate it. It
     # refines a time offset that is "estimate".
     is_fixed = {
         "scale": config.is_known("scale"),
@@ -424,7 +424,7 @@ def _solve_stream(
 
 
 def _with_opinions(dnlo: Solved, pose_pairs: PosePairs, reason: str) -> Solved:
-    """Return a solution of DNLO that replaces one of the noise model, with second opinions."""
+    """Return a solution of DNLO, used instead of the noise model, with second opinions."""
     T_parent_child = dnlo.solution.T_parent_child
     opinions = second_opinions(
         pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, T_parent_child
@@ -440,8 +440,8 @@ def _of_model(
 ) -> Solved:
     """Assess a solution of the adaptive estimator.
 
-    The motion pairs of the result contain the scale and the time offset of the solution. ``reason``
-    is the reason for the method.
+    The motion pairs of the result contain the scale and time offset of the solution. ``reason`` is
+    the reason for the method.
     """
     stamps_ns = pose_pairs.stamps_ns
     child = Trajectory(stamps_ns, pose_pairs.Ts_cw_c).scaled(solution.scale)
@@ -475,7 +475,7 @@ def _of_model(
 
 
 def _motion_pairs(pose_pairs: PosePairs, reference: str) -> MotionPairs:
-    """Return the motion pairs of a reference; a NotEnoughDataError if there are none."""
+    """Return the motion pairs of a reference. Raise NotEnoughDataError if there are none."""
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     if len(pairs) == 0:
         raise NotEnoughDataError(
@@ -529,8 +529,8 @@ def _solve_pairs(
     pose_pairs : PosePairs
     config : CalibratorConfig
     adaptive : AdaptiveSolution, optional
-        Solution of the adaptive estimator, which chooses the reference ``auto``. By default, it is
-        computed if the reference is ``auto``.
+        Solution of the adaptive estimator, from which the reference ``auto`` is chosen. By default,
+        it is computed if needed.
     """
     method = Method(
         config.method,

@@ -1,8 +1,8 @@
-"""Kinds of data: the functions and limits in which they differ on the road to a result.
+"""Kinds of data, with the functions and limits that differ between kinds.
 
-The road is the same for all kinds (:mod:`hand_eye_calib.core.engine.run`). A kind is registered in
-``KINDS`` (:mod:`hand_eye_calib.core.base.registry`) under what both sensors measure together
-(``measured`` of :class:`~hand_eye_calib.core.base.config.CalibratorConfig`).
+The steps to a result are the same for all kinds (:mod:`hand_eye_calib.core.engine.run`). A kind is
+registered in ``KINDS`` (:mod:`hand_eye_calib.core.base.registry`) under the data of both sensors
+together (``measured`` of :class:`~hand_eye_calib.core.base.config.CalibratorConfig`).
 """
 
 from collections.abc import Callable, Mapping
@@ -18,9 +18,9 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 @dataclass(frozen=True)
 class Kind:
-    """Kind of data, such as poses or positions: how to solve and how to check it.
+    """Kind of data, such as poses or positions, with its functions for solves and checks.
 
-    Snapshots are of type Any here, because :mod:`hand_eye_calib.core.engine.snapshot` imports this
+    Snapshots have type Any here, because :mod:`hand_eye_calib.core.engine.snapshot` imports this
     module.
 
     Attributes
@@ -37,8 +37,8 @@ class Kind:
     is_timed_by_speed : bool
         Whether the time offset is estimated from speeds instead of angular rates.
     allowed : mapping
-        Options that this kind cannot obey: name of the option to the values that are allowed
-        nevertheless, because they change nothing.
+        Options that this kind cannot obey, with the values that are still allowed because they
+        change nothing.
     has_conventions : bool
         Whether checks detect wrong conventions, units and clocks even if the solve fails.
     """

@@ -30,8 +30,8 @@ INVERSIONS = frozenset({"parent_invert", "child_invert"})
 def solve(snapshot: Snapshot, cross_check: bool | None) -> Calibration:
     """Solve synchronised poses, and cross-check the result if requested.
 
-    If ``cross_check`` is None, the result is cross-checked unless the user has chosen the
-    reference of the motions, such as B1.
+    If ``cross_check`` is None, the result is cross-checked unless the user chose a reference such
+    as B1.
     """
     config = snapshot.config
     pairs = snapshot.pose_pairs
@@ -50,8 +50,8 @@ def check(
     ----------
     snapshot : Snapshot
     calibration : Calibration, optional
-        Result of these streams, whose time offset, scale and extrinsic the check uses. Without a
-        result, the check uses the time offset and the scale in the options if they are numbers.
+        Result of these streams. The check uses its time offset, scale and extrinsic. Without a
+        result, it uses the time offset and the scale of the options if they are numbers.
     """
     config = snapshot.config
     result = checking.check_streams(
@@ -96,9 +96,9 @@ def _limited_by_prior(
     config: CalibratorConfig,
     calibration: Calibration | None,
 ) -> FloatArray:
-    """Return a covariance (6, 6) whose standard deviations are at most those of the priors.
+    """Return a covariance (6, 6) limited to the standard deviations of the priors.
 
-    The covariance is that of an error of the motion, in the child's axes.
+    The covariance is for an error of the motion, in the child's axes.
     """
     priors = config.prior()
     if calibration is None or not priors:
@@ -116,7 +116,7 @@ def _limited_by_prior(
 def _extrinsic_estimate(
     calibration: Calibration | None,
 ) -> checking.ExtrinsicEstimate | None:
-    """Return the extrinsic of a result, and its standard deviations (6,); None without a result.
+    """Return the extrinsic of a result with standard deviations (6,), or None without a result.
 
     All standard deviations are infinite if the result does not determine every axis.
     """
@@ -131,13 +131,13 @@ def _extrinsic_estimate(
 def _obsolete_codes(
     snapshot: Snapshot, calibration: Calibration | None
 ) -> set[str]:
-    """Return the codes of findings that do not apply to this snapshot or to this result."""
+    """Return the codes of findings that are obsolete for this snapshot or this result."""
     obsolete = set()
     if len(snapshot.kept):
-        # Kept pairs are downsampled, so that they have gaps even if the streams had none.
+        # Kept pairs are downsampled, so they have gaps even if the streams have none.
         obsolete.add("gaps")
-    # Motion that turns about one axis only leaves a direction of translation unobservable. If the
-    # result determines all of them, the motion turns about two axes.
+    # If all motion turns about one axis, a direction of translation is unobservable. So if the
+    # result determines all directions, the motion turns about two axes.
     if calibration:
         unobserved = {DofVerdict.UNOBSERVABLE, DofVerdict.PRIOR}
         if unobserved.isdisjoint(

@@ -1,13 +1,13 @@
-"""Choice between two readings of both streams.
+"""Choice between the two readings of both streams.
 
-A reading is an interpretation of both streams, as poses or as inverse poses of the sensors. The
-second reading inverts all poses of the first one. Both readings fit equally well
-(:class:`~hand_eye_calib.core.checks.hypothesis.Readings`), so two other criteria distinguish them:
-the likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`) and the shape of the
-motion. The noise decides unless a clear shape contradicts the noise. In a small space the shape
-must support the noise, because the poses of a camera that observes a target have the same noise as
-inverted poses. If the criteria are not clear, both results are reported, and the verdict is DO NOT
-USE.
+A reading assumes that both streams contain poses of the sensors, or inverse poses. The second
+reading inverts all poses of the first reading. Both fit equally well
+(:class:`~hand_eye_calib.core.checks.hypothesis.Readings`), so there are two other criteria: the
+likelihood of the noise (:mod:`~hand_eye_calib.core.noise.readings`), and the shape of the motion.
+The noise decides, unless a clear shape is evidence for the other reading. In a small space, the
+noise decides only if the shape is evidence for the same reading: a camera that observes a target
+has the same noise as inverse poses. If the criteria are not clear, the verdict is DO NOT USE, and
+both results are reported.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -27,17 +27,18 @@ from hand_eye_calib.core.noise.readings import loss_difference
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 
-# The noise decides between both readings if their losses (negative log likelihoods) differ by more
-# than this. In 200 recordings without target cameras whose first reading is right, the loss of the
-# second reading was never smaller by more than 9.
+# The noise decides if the losses (negative log likelihoods) of both readings differ by more than
+# this. In 200 recordings without target cameras, the loss of the wrong reading was at most 9
+# smaller than that of the right one.
 CLEAR_NOISE = 20.0
 
-# Smallest absolute `Readings.shape` (a logarithm) that overrules the noise. In 190 recordings the
-# shape never had the wrong sign. The noise was wrong for a stream almost without errors, and there
-# the shape was -2.9.
+# A shape decides against the noise if `Readings.shape` (a logarithm) exceeds this in size. In 190
+# recordings, the shape never had the wrong sign. The noise was wrong for a stream almost without
+# errors, and the shape there was -2.9.
 _OVERRULING_SHAPE = 2.0
 
-# Smallest `Readings.paths` (a logarithm) that supports the noise in a small space.
+# In a small space, `Readings.paths` (a logarithm) is evidence for the reading of the noise if it
+# exceeds this.
 _CLEAR_PATHS = 0.06
 
 
@@ -50,7 +51,7 @@ class Choice:
     findings : tuple of Finding
         Findings of the check for the chosen reading.
     doubts : tuple of Finding
-        Findings about an uncertain choice, which are added to the result.
+        Findings about an uncertain choice. They are added to the result.
     is_repair : bool
         Whether the chosen reading sets options, such as ``child_invert``.
     """
@@ -72,10 +73,10 @@ def choose(
     result : CheckResult
         Check whose ``readings`` are not None.
     pairs_of : callable
-        ``pairs_of(options)`` returns the pose pairs with these options, on one clock.
+        Function ``pairs_of(options)`` that returns the pose pairs with these options, on one clock.
     answer_with : callable
-        ``answer_with(options)`` returns the result with these options, on one clock; None if the
-        solve fails.
+        Function ``answer_with(options)`` that returns the result with these options, on one clock;
+        None if the solve fails.
     """
     readings = result.readings
     assert readings is not None
@@ -97,7 +98,7 @@ def choose(
         index = 0 if can_be_right else int(readings.shape > 0.0)
     elif index == 1 and can_be_right and readings.is_small:
         doubts = (finding("inverse_small", "both"),)
-    # The findings of the chosen reading replace those of both readings.
+    # The findings of the chosen reading replace the findings of both readings.
     codes = {"inverse_both"}
     for findings in findings_of_readings:
         codes.update(suspect.code for suspect in findings)
@@ -112,24 +113,24 @@ def choose(
 def decide(
     readings: Readings, difference: float, has_late_stamps: bool = False
 ) -> int | None:
-    """Return the index of the right reading; None if noise and shape do not decide clearly.
+    """Return the index of the right reading, or None if noise and shape are not clear.
 
     Parameters
     ----------
     readings : Readings
     difference : float
-        Loss of the second reading minus the loss of the first.
+        Loss of the second reading minus loss of the first reading.
     has_late_stamps : bool
-        Whether the stamps of a stream are those of arrival.
+        Whether the stamps of a stream are times of arrival.
     """
     by_noise = 0
     if abs(difference) > CLEAR_NOISE:
         by_noise = -int(np.sign(difference))
-    # Late stamps move each pose along its path, which looks like the noise of inverse poses. Then a
-    # clear shape decides alone.
+    # Late stamps move each pose along its path, which looks like the noise of inverse poses. A
+    # clear shape then decides alone.
     if has_late_stamps and readings.by_shape != 0:
         by_noise = 0
-    choice = _vote(readings, by_noise)
+    choice = _clear_choice(readings, by_noise)
     can_be_right = readings.hypotheses[0].is_uninverted
     if (
         choice == 1
@@ -137,48 +138,50 @@ def decide(
         and has_late_stamps
         and readings.by_shape <= 0
     ):
-        # An excavator with late stamps was read as inverse, 5 m off.
+        # Without this rule, an excavator with late stamps was read as inverse, 5 m off.
         return None
     if choice == 0 and can_be_right:
-        # Without a clear vote, the streams stay as they are if no criterion supports an inversion.
+        # If nothing is clear, keep the streams as they are, unless a criterion is evidence for
+        # inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0
         choice = 0 if is_inversion_supported else -1
-    # From a vote (1 for the second reading, -1 for the first) to an index.
+    # Convert 1 (second reading) and -1 (first reading) to an index.
     return {1: 1, -1: 0}.get(choice)
 
 
-def _vote(readings: Readings, by_noise: int) -> int:
-    """Return 1 for the second reading, -1 for the first, and 0 without a clear vote.
+def _clear_choice(readings: Readings, by_noise: int) -> int:
+    """Return 1 for the second reading, -1 for the first, and 0 if neither is clear.
 
-    ``by_noise`` has the same values, and is the vote of the noise alone.
+    ``by_noise`` has the same values; it is the choice by the noise alone.
     """
     by_shape = readings.by_shape
     if by_noise == 0:
         return by_shape if readings.is_clear else 0
     if readings.is_small and by_noise != by_shape:
-        return _vote_in_small_space(readings, by_noise)
+        return _choice_in_small_space(readings, by_noise)
     if by_noise == -by_shape:
-        # Only a very clear shape overrules the noise. The noise overrules no clear shape.
+        # Only a very clear shape decides against the noise. If the shape is clear but not so much,
+        # nothing decides.
         return by_shape if abs(readings.shape) > _OVERRULING_SHAPE else 0
     return by_noise
 
 
-def _vote_in_small_space(readings: Readings, by_noise: int) -> int:
-    """Return the vote in a small space if the shape does not support the noise, see _vote."""
+def _choice_in_small_space(readings: Readings, by_noise: int) -> int:
+    """Return the clear choice in a small space, if shape and noise do not agree."""
     by_shape = readings.by_shape
-    # The paths alone may support the noise.
+    # The paths alone, without the lever arms, may agree with the noise.
     if by_noise * readings.paths > _CLEAR_PATHS:
         return by_noise
-    # If both readings invert a stream, the streams cannot stay as they are.
+    # If both readings invert a stream, no reading keeps the streams as they are.
     if not readings.hypotheses[0].is_uninverted:
         return by_shape or by_noise
-    # Without a vote of the shape, the noise can only confirm the streams as they are.
+    # If the shape is not clear, the noise may only confirm the streams as they are.
     is_confirmed = by_noise < 0 and by_shape == 0
     return by_noise if is_confirmed else 0
 
 
 def _loss_difference(first: PosePairs, second: PosePairs) -> float:
-    """Return the loss of the second reading minus that of the first, at their common stamps.
+    """Return the loss of the second reading minus the loss of the first, at common stamps.
 
     The difference is 0 if the scale or the noise model of a reading cannot be estimated.
     """
@@ -208,7 +211,7 @@ def _loss_difference(first: PosePairs, second: PosePairs) -> float:
 
 
 def _options_of(findings: Collection[Finding]) -> dict[str, float | str]:
-    """Return the options that all findings propose."""
+    """Return all options that the findings propose."""
     options: dict[str, float | str] = {}
     for suspect in findings:
         options.update(suspect.options)
@@ -220,7 +223,7 @@ def _unclear(
     answers: Sequence[Calibration | None],
     difference: float,
 ) -> Finding:
-    """Return the finding that both readings are possible, with the results of both readings."""
+    """Return the finding that both readings are possible, with their results."""
     texts = []
     for reading_options, answer in zip(options, answers, strict=True):
         values = options_in_words(reading_options)

@@ -60,7 +60,8 @@ from hand_eye_calib.core.results.calibration import Calibration
 #: finished, 0 to 1, and name of the step.
 Progress: TypeAlias = Callable[[float, str], None]
 
-# Share of the work that is finished when the checks begin: an estimate for the display of progress.
+# Share of the work that is finished before the checks. It is an estimate, for the display of
+# progress.
 _CHECKS_BEGIN = 0.8
 
 # Reasons to estimate an option, without the estimate.
@@ -69,17 +70,18 @@ _REASONS_TO_ESTIMATE = {
     "scale": "the lengths may differ",
 }
 
-# Codes of findings, besides those about conventions, that are certain enough for a second solve.
+# Codes of findings that are certain enough for a second solve, in addition to those about
+# conventions.
 _CERTAIN_CODES = ("time_offset", "scale", "units", "unit_or_scale")
 
-# Codes of findings whose option is estimated in the second solve, so that the result contains the
+# Codes of findings whose option is estimated in the second solve. The result then contains the
 # uncertainty of its value.
 _ESTIMATED_CODES = ("time_offset", "scale", "unit_or_scale")
 
 
 @dataclass(frozen=True)
 class _Reading:
-    """Chosen reading of both streams: as poses, or both as inverse poses.
+    """Chosen reading of both streams: poses, or inverse poses.
 
     Attributes
     ----------
@@ -88,7 +90,7 @@ class _Reading:
     doubts : tuple of Finding
         Findings about an uncertain choice.
     settled : frozenset of str
-        Options that must not be changed after the choice.
+        Options that must stay unchanged after the choice.
     """
 
     findings: tuple[Finding, ...]
@@ -110,7 +112,8 @@ def run(
         Streams and options.
     checks : bool, optional
         False skips stream checks, cross-checks and further solves. True cross-checks the result
-        even if the user set a reference; by default, such a result is not cross-checked.
+        even if the user set a reference. By default, a result with such a reference is not
+        cross-checked.
     progress : callable, optional
         See :data:`Progress`.
 
@@ -150,7 +153,8 @@ def review(
     snapshot : Snapshot
         Poses and options of the result.
     settled : collection of str
-        Options that an earlier check has set. Like options of the user, they are not changed.
+        Options that an earlier check has set. They are treated like options of the user, and not
+        changed.
     """
     return _best(checked(calibration, snapshot), settled, None)
 
@@ -165,7 +169,7 @@ def _solved_and_checked(
     try:
         calibration = snapshot.estimate(cross_check=checks)
     except NotEnoughDataError:
-        # With some mistakes, no poses can be paired, or no scale can be estimated.
+        # With some mistakes, poses cannot be paired, or the scale cannot be estimated.
         can_repair = kind_of(snapshot.config).has_conventions
         repaired = _repaired_unsolved(snapshot) if can_repair else None
         if not repaired:
@@ -178,14 +182,14 @@ def _solved_and_checked(
 def _best(
     first: Attempt, settled: Collection[str], on_clock: Attempt | None
 ) -> Attempt:
-    """Return the best attempt: the first one, or one solved again with options from its check.
+    """Return the best attempt: the first one, or one solved again with options of its check.
 
-    First a reading is chosen: both streams as poses, or both as inverse poses. Then options that a
-    certain check demands are set. If they repair a stream, the time offset and the scale are
-    estimated after the repair, not here.
+    First a reading is chosen (poses or inverse poses). Then options that a check is certain of are
+    set. If they repair a stream, the time offset and the scale are estimated after the repair, not
+    here.
 
     ``settled`` are options that must not be changed. ``on_clock`` is the attempt with an estimated
-    time offset if there is one already.
+    time offset, if it already exists.
     """
     reading = _reading_of(
         first.snapshot, first.check, settled, first.calibration.time_offset_s
@@ -219,10 +223,10 @@ def _reading_of(
     settled: Collection[str],
     known_s: float,
 ) -> _Reading:
-    """Decide whether both streams hold poses or inverse poses, if both readings fit equally well.
+    """Choose between poses and inverse poses in both streams, if both fit equally well.
 
     ``settled`` are options that must not be changed. ``known_s`` is the time offset (s) that was
-    applied before the check; the check may have estimated a further one.
+    applied before the check, to which the check may have added an estimate.
     """
     if INVERSIONS & snapshot.config.given.union(settled):
         return _Reading(_without_readings(result))
@@ -247,9 +251,9 @@ def _reading_of(
 
 
 def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
-    """Return the findings except warnings that both streams are inverse.
+    """Return the findings without warnings that both streams are inverse.
 
-    The user or an earlier choice has decided about inversions.
+    The user or an earlier choice has already decided about inversions.
     """
     return tuple(
         finding
@@ -262,7 +266,7 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 
 
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
-    """Repair streams that cannot be solved otherwise; return None if no repair is certain."""
+    """Repair streams that cannot be solved without it. Return None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(
         snapshot, result, (), snapshot.config.given_time_offset_s
@@ -281,22 +285,22 @@ def _repaired(
     settled: Collection[str],
     verdict_as_given: str,
 ) -> Attempt | None:
-    """Return the attempt with repaired streams; None if the repaired streams do not agree.
+    """Return the attempt with repaired streams, or None if the repaired streams do not agree.
 
-    A time offset or scale is estimated after the repair. It is estimated together with the repair
-    if otherwise no poses can be paired.
+    A time offset or scale is estimated after the repair. If poses cannot be paired otherwise, it is
+    estimated together with the repair.
 
     Parameters
     ----------
     snapshot : Snapshot
     findings : collection of Finding
-        Findings of the check, for the message.
+        Findings of the check. They are used in the message.
     certain_options : mapping
-        Options that certainly repair the streams, see :func:`_certain`.
+        Options that certainly repair the streams; see :func:`_certain`.
     settled : collection of str
         Options that must not be changed.
     verdict_as_given : str
-        Verdict of the streams without the repair, for the message.
+        Verdict of the streams without the repair. It is used in the message.
     """
     second, options = _solved_as_repaired(snapshot, certain_options)
     if not second:
@@ -354,8 +358,8 @@ def _solved_as_repaired(
 
 
 def _doubts_beside_a_repair(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings of the streams as given that a repair does not settle, as warnings."""
-    # A difference of lengths may also be a scale of the child instead of a unit of the parent.
+    """Return findings of the original streams that a repair does not settle, as warnings."""
+    # A difference of lengths may be a scale of the child instead of a unit of the parent.
     doubts = [
         replace(finding, severity=Severity.WARNING, options={})
         for finding in findings
@@ -367,9 +371,9 @@ def _doubts_beside_a_repair(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def _contradicts_repair(finding: Finding) -> bool:
-    """Return whether a finding after a repair proves that the streams still do not agree.
+    """Return whether a finding after a repair proves that the streams still disagree.
 
-    A difference of lengths that is either a unit or a scale is no such proof.
+    A difference of lengths is no proof if it may be a unit or a scale.
     """
     return finding.makes_unusable and finding.code != "unit_or_scale"
 
@@ -417,10 +421,10 @@ def _estimated(
 def _unit_doubts(
     findings: Collection[Finding], calibration: Calibration
 ) -> tuple[Finding, ...]:
-    """Return findings which warn that an estimated scale may be a wrong unit of length.
+    """Return findings that warn that an estimated scale may be a wrong unit of length.
 
-    A finding is an error if the scale in the check or in the result equals that of the unit within
-    its uncertainty, otherwise a warning.
+    A finding is an error if the scale equals the scale of the unit within its uncertainty, in the
+    check or in the result. Otherwise it is a warning.
     """
     doubts = []
     for finding in findings:
@@ -471,7 +475,7 @@ def _with_estimate_warnings(
 def _with_offset_doubt(
     attempt: Attempt, doubts: Collection[Finding]
 ) -> Attempt:
-    """Return the attempt with doubts, and with one more if the estimated time offset is large."""
+    """Return the attempt with doubts, and a further doubt if the estimated time offset is large."""
     offset_s = attempt.calibration.time_offset_s
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
@@ -489,8 +493,8 @@ def _with_offset_doubt(
 def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     """Return the findings about the streams without repairs, the gravest first.
 
-    As in :func:`run`, the check starts from a solve, and one of two readings is chosen. Clock
-    offset and scale in the findings are those that :func:`run` estimates.
+    Like :func:`run`, the check starts from a solve, and one of two readings is chosen. Clock offset
+    and scale in the findings are those that :func:`run` would estimate.
 
     Raises
     ------
@@ -530,9 +534,9 @@ def _certain(
 ) -> dict[str, float | str]:
     """Return the options that certainly repair a stream, except those in ``fixed``.
 
-    Values of units and conventions are those of the findings. Time offset and scale get the value
+    Values of units and conventions come from the findings. Time offset and scale get the value
     "estimate", so that the result contains their uncertainty. A difference of lengths of a few per
-    cent is only a warning, because odometry with a drifting scale has the same effect.
+    cent is only a warning: odometry with a drifting scale has the same effect.
     """
     certain_options: dict[str, float | str] = {}
     for finding in findings:
@@ -552,7 +556,7 @@ def _certain(
 
 
 def options_to_solve(finding: Finding) -> Options:
-    """Return the options of a finding for a solve; offset and scale are estimated in the solve."""
+    """Return the options of a finding for a solve, which estimates offset and scale."""
     # A clock offset of 0 needs no estimation.
     is_zero = finding.options == {"time_offset": 0.0}
     if finding.code in _ESTIMATED_CODES and not is_zero:

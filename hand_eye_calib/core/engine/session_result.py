@@ -1,4 +1,4 @@
-"""Result of a session of the node, for the process that writes the pages of the session."""
+"""Result of a node's session, for the process that writes the pages of the session."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

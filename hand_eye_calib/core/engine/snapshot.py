@@ -1,4 +1,4 @@
-"""Snapshots of poses and options for an estimate. Poses that arrive later do not change them."""
+"""Snapshots of poses and options for an estimate. Later poses do not change them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -37,19 +37,19 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 STREAMS = ("parent", "child")
 
-# Largest time offset (s) for which poses are not paired anew. The noise model corrects such an
-# offset by moving poses along their velocities.
+# Poses are paired anew if the time offset changes by more than this (s). The noise model corrects a
+# smaller change by moving poses along their velocities.
 MOST_MOVED_S = 0.003
 
-# Largest time offset (s) that is estimated without a warning if the user did not request it.
+# If the user did not request an estimate, a larger estimated time offset (s) causes a warning.
 UNASKED_S = 1.0
 
-# Largest number of pose pairs of whole trajectories if the user does not set `max_pairs`: three
+# Largest number of pose pairs from whole trajectories, unless the user sets `max_pairs`: three
 # hours at 10 Hz. The noise model needs 8 kB per pair.
 _MAX_PAIRS = 100_000
 
-# Longest gap in which the stream checks interpolate, in median intervals between kept pairs. Kept
-# pairs are downsampled, so that they are farther apart than poses.
+# Longest gap that the stream checks interpolate, in median intervals between kept pairs. Kept pairs
+# are downsampled, so the distance between them is larger than between poses.
 _GAP_INTERVALS = 4
 
 
@@ -63,7 +63,7 @@ class Snapshot:
     kept : PosePairs
         Pose pairs that were made before.
     buffered_parent, buffered_child : Trajectory
-        Poses that are not paired yet, as they were received.
+        Unpaired poses, as they were received.
     paired_at : {"parent", "child"} or None
         Stream whose stamps the pairs have; None for the slower stream.
     parent_names, child_names : StreamFrames
@@ -73,8 +73,9 @@ class Snapshot:
     time_offset : TimeOffset or None
         Time offset of the kept pairs, if it was estimated.
     beside_motion : tuple
-        Measurements of the extrinsic in addition to motion, such as by the ground. The method
-        ``joined(calibration, snapshot)`` of each returns the calibration joined with it.
+        Measurements of the extrinsic that do not come from motion, such as those from the ground.
+        The method ``joined(calibration, snapshot)`` returns the calibration combined with the
+        measurement.
     bags : tuple of Path
         Bags that contain the streams, for pictures of the report; empty for other sources.
     """
@@ -93,16 +94,16 @@ class Snapshot:
 
     @property
     def parent_frame(self) -> str:
-        """Name of the parent sensor's frame, also if the options invert the poses."""
+        """Name of the parent sensor's frame, which stays the same if options invert the poses."""
         return self._frame("parent")
 
     @property
     def child_frame(self) -> str:
-        """Name of the child sensor's frame, also if the options invert the poses."""
+        """Name of the child sensor's frame, which stays the same if options invert the poses."""
         return self._frame("child")
 
     def _frame(self, stream: str) -> str:
-        """Return the name of a stream's sensor frame; a default if the frame has no name."""
+        """Return the name of a stream's sensor frame, or a default name."""
         names, other = self._names(stream)
         name = names.name
         if (
@@ -163,9 +164,9 @@ class Snapshot:
 
     @property
     def unpaired(self) -> tuple[Trajectory, Trajectory]:
-        """Trajectories of parent and child, of all poses that are not paired yet.
+        """Trajectories of parent and child, with all poses that are not paired yet.
 
-        The options about conventions and units are applied, and the clock rate of the child.
+        Options about conventions and units, and the clock rate of the child, are applied.
         """
         parent = _corrected(self.buffered_parent, "parent", self.config)
         child = _corrected(self.buffered_child, "child", self.config)
@@ -177,8 +178,8 @@ class Snapshot:
     def resolved(self) -> "Snapshot":
         """The same snapshot with its time offset as a number (s).
 
-        If the option ``time_offset`` is "estimate", the number is the offset of the kept pairs. If
-        there are none, it is estimated from the buffered poses.
+        If the option ``time_offset`` is "estimate", the number is the offset of the kept pairs, or
+        without kept pairs an estimate from the buffered poses.
 
         Raises
         ------
@@ -215,7 +216,7 @@ class Snapshot:
 
     @cached_property
     def pose_pairs(self) -> PosePairs:
-        """Synchronised pose pairs: the kept pairs, then pairs of the buffered poses.
+        """Synchronised pose pairs: the kept pairs, followed by pairs of the buffered poses.
 
         Raises the same errors as :attr:`resolved`.
         """
@@ -236,7 +237,7 @@ class Snapshot:
         return downsample(pairs, self.config.max_pairs)
 
     def examined(self, calibration: Calibration) -> Calibration:
-        """Return a calibration with the examinations of the extras, which depend on its sigmas."""
+        """Return a calibration with the examinations of extras, which depend on its sigmas."""
         for examine in RESULT_EXAMINATIONS.values():
             calibration = examine(calibration, self.resolved)
         return calibration
@@ -247,19 +248,19 @@ class Snapshot:
         Parameters
         ----------
         cross_check : bool, optional
-            Whether to compare the result with those of other strides and of both halves. By
-            default, the result is compared unless the user has set a reference. If False, the
-            examinations of extras are skipped, too.
+            Whether to compare the result with results of other strides and of both halves. By
+            default, it is compared unless the user set a reference. With False, the examinations of
+            extras are also skipped.
 
         Raises
         ------
         NotEnoughDataError
             If fewer than ``min_pairs`` poses can be paired; the message names the missing data.
         InputError
-            If both streams have the same sensor frame, or an option names the frame of the other
-            stream.
+            If both streams have the same sensor frame, or if an option gives one stream the frame
+            of the other.
         ConfigError
-            If an option has no meaning for the quantities that the streams measure.
+            If an option has no effect on the quantities that the streams measure.
         """
         self._check_frames()
         kind = kind_of(self.config)
@@ -282,8 +283,8 @@ class Snapshot:
     def streams(self) -> tuple[Trajectory, Trajectory]:
         """Trajectories of the whole session, each stream on its own clock.
 
-        If there are kept pairs, the trajectories contain the poses of all pairs; otherwise all
-        poses that were received.
+        With kept pairs, the trajectories contain the poses of all pairs; without, all received
+        poses.
         """
         parent, child = self.unpaired
         if len(self.kept):
@@ -297,7 +298,7 @@ class Snapshot:
         )
 
     def require_pairs(self) -> None:
-        """Raise NotEnoughDataError, with the reason, if too few poses can be paired."""
+        """Raise NotEnoughDataError with the reason if too few poses can be paired."""
         resolved = self.resolved
         pairs = self.pose_pairs
         if len(pairs) < resolved.config.min_pairs:
@@ -339,7 +340,7 @@ class Snapshot:
 
 
 def _measuring(trajectory: Trajectory, measures: str) -> Trajectory:
-    """Return the trajectory with the measured quantity of the option, unless that is "auto"."""
+    """Return the trajectory with the measured quantity of the option, except for "auto"."""
     if measures in ("auto", trajectory.measures):
         return trajectory
     return replace(trajectory, measures=measures)
@@ -353,7 +354,7 @@ def _corrected(
     Raises
     ------
     ConfigError
-        If the options have no meaning for the quantity that the stream measures.
+        If the options have no effect on the quantity that the stream measures.
     """
     invert = getattr(config, f"{stream}_invert")
     order = getattr(config, f"{stream}_quaternion")
@@ -424,7 +425,7 @@ def names_of(
 def estimated_time_offset(
     config: CalibratorConfig, parent: Trajectory, child: Trajectory
 ) -> TimeOffset:
-    """Estimate the time offset of two streams, from the rates that their kind of data has."""
+    """Estimate the time offset of two streams from the rates of their kind of data."""
     of_speed = kind_of(config).is_timed_by_speed
     return estimate_time_offset(parent, child, config.max_gap, of_speed)
 
@@ -432,8 +433,8 @@ def estimated_time_offset(
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
     """Return at most ``max_pairs`` of the pose pairs.
 
-    In each round, every second pair is a candidate. Candidates are dropped if the parent rotates
-    least between their neighbours. The rounds end if at most ``max_pairs`` remain.
+    In each round, every second pair is a candidate. Candidates between whose neighbours the parent
+    rotates least are dropped. The rounds end when at most ``max_pairs`` remain.
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
@@ -459,7 +460,7 @@ def pair_poses(
     at: str | None,
     kept: PosePairs,
 ) -> PosePairs:
-    """Pair two trajectories; return the pairs that are keyframes and later than ``kept``.
+    """Pair two trajectories. Return the pairs that are keyframes and later than ``kept``.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from hand_eye_calib.core.results.calibration import Calibration
 
 
 def with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
-    """Return a finding about the scale with the scale of a result; other findings unchanged."""
+    """Return a finding about the scale with the scale of a result. Other findings are unchanged."""
     if (
         finding.code not in ("scale", "unit_or_scale")
         or not calibration.scale_sigma
@@ -23,7 +23,8 @@ def with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
 def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
     """Return a finding about the clock offset with the time offset of a result; others unchanged.
 
-    The offset of the check has no noise model, so that it differs from the estimated one.
+    The check estimates its offset without a noise model, so it differs from the offset of the
+    result.
     """
     if finding.key != "time_offset" or not calibration.time_offset_sigma_s:
         return finding
@@ -36,10 +37,10 @@ def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
 
 
 def note_on_unit(snapshot: Snapshot) -> str:
-    """Return a note that the parent's lengths may be metres, and the child's scale may be wrong.
+    """Return a note that the parent may be in metres, and the child's scale wrong.
 
     The streams agree equally well with a unit of the parent and with a scale of the child, but the
-    lengths of the two results differ by a factor. The note is empty in these cases:
+    lengths of both results differ by a factor. The note is empty in these cases:
 
     - the user set the child's scale;
     - the user set no unit of the parent;

@@ -25,10 +25,10 @@ from hand_eye_calib.offline.cli.options import (
 )
 from hand_eye_calib.offline.cli.reading import Recording
 
-# Longest pause (s) between the parts of a recording. A recorder can be restarted in less time.
-# After a longer pause, odometry has often been restarted, too.
+# Longest pause (s) between the parts of a recording. A recorder restarts in less time. In a longer
+# pause, odometry has often restarted as well.
 _MAX_PAUSE_S = 60.0
-# Longest overlap (s) of consecutive parts: the last poses of a part may be written after the next
+# Longest overlap (s) of successive parts: the last poses of a part may be written after the next
 # part has begun.
 _MAX_OVERLAP_S = 1.0
 
@@ -39,7 +39,7 @@ class SeveralRecordingsError(InputError):
     Attributes
     ----------
     reason : str
-        Which bags are different recordings, and why.
+        Bags that are different recordings, and the reason.
     groups : list of list of pathlib.Path
         Bags of each recording.
     """
@@ -69,7 +69,7 @@ def read_recording(
     options : mapping
         Options that the user has set.
     without : collection of str
-        Names of the measurements in addition to motion that are switched off.
+        Names of the measurements without motion that are switched off.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def select(
     sources : dict of str to Source
         Topic or frames of each stream.
     measures : dict of str to str
-        What each stream measures, such as "poses".
+        Quantity that each stream measures, such as "poses".
     """
     named = {
         stream: source_of(wanted[stream])
@@ -146,7 +146,7 @@ def read_sources(
     ----------
     bag : PoseBag
     measures : sequence of (Source, str, str)
-        Sources, what they measure, and the stamps to use: "header" or "receive".
+        Sources, their quantities, and the stamps to use: "header" or "receive".
 
     Returns
     -------
@@ -156,7 +156,7 @@ def read_sources(
     """
     trajectories = []
     repairs: list[str] = []
-    # Errors name the options of a stream. The sensors of a rig share those options.
+    # Errors name the options of a stream. All sensors of a rig share these options.
     streams = (
         STREAMS
         if len(measures) == len(STREAMS)
@@ -259,7 +259,7 @@ def refuse_recordings(
 
 
 class _Bag(NamedTuple):
-    """Times of a bag (ns), and the sources that it contains. Bags are sorted by their times."""
+    """Times (ns) and sources of a bag. Bags are sorted by their times."""
 
     begin_ns: int
     end_ns: int
@@ -268,7 +268,7 @@ class _Bag(NamedTuple):
 
     @classmethod
     def of(cls, path: Path, candidates: Collection[Source]) -> Self:
-        """Read the times of a bag, and which of the candidates it contains."""
+        """Read the times of a bag, and the sources among the candidates that it contains."""
         sources = set()
         with PoseBag(path) as bag:
             for source in candidates:
@@ -278,7 +278,7 @@ class _Bag(NamedTuple):
             return cls(bag.start_ns or 0, bag.end_ns or 0, path, sources)
 
     def difference_from(self, earlier: "Sequence[_Bag]") -> str:
-        """Return why the bag does not continue earlier bags; empty if it does."""
+        """Return the reason why the bag does not continue earlier bags; empty if it does."""
         if not earlier:
             return ""
         latest = max(earlier, key=lambda bag: bag.end_ns)
@@ -295,9 +295,9 @@ class _Bag(NamedTuple):
 
 
 def journal_in(path: Path | str) -> Path | None:
-    """Return the directory of the journal that a path names; None if the path is a bag.
+    """Return the directory of the journal at a path; None if the path is a bag.
 
-    The path is this directory itself, or the output directory of a node, which contains it.
+    The path is this directory, or the output directory of a node that contains it.
     """
     if isinstance(path, str) or not path.is_dir():
         return None
@@ -319,8 +319,8 @@ def read_journal_of(directory: Path, options: Options) -> Recording:
     with waiting_for(f"reading {directory}"):
         journal = read_journal(directory)
         session = journal.about["parent"]
-        # The session may be of an earlier version. Skip an option that no longer exists if its
-        # value is empty; any other value is an error.
+        # The session may be of an earlier version. An option that no longer exists is skipped if
+        # its value is empty; otherwise it is an error.
         before = {
             name: value
             for name, value in session.get("options", {}).items()

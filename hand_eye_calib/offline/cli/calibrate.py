@@ -1,8 +1,8 @@
 """``calibrate PATH ...``: calibrate from files, bags or journals.
 
-The paths are one of these: two trajectory files; a bag or the parts of a bag; the journal of a
-session; several recordings; the stops of an arm; the files of three sensors or more. The command
-``replay`` is the same for bags and journals only.
+Possible paths are: two trajectory files; a bag or its parts; the journal of a session; several
+recordings; the stops of an arm; the files of three or more sensors. The command ``replay`` does the
+same for bags and journals only.
 """
 
 import argparse
@@ -151,7 +151,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in labels:
         if labels.count(name) > 1:
             raise ConfigError(f"--label {name} was given twice; keep one")
-    # A pattern in quotes is not expanded by the shell, and a pattern in a URL never.
+    # The shell does not expand a pattern in quotes, or in a URL.
     if any("*" in str(path) for path in arguments.paths):
         from hand_eye_calib.formats.bags.patterns import matching
 
@@ -173,10 +173,10 @@ def _run_locally(
 ) -> int:
     """Calibrate from local files, and return the exit code.
 
-    ``with_urls`` replaces, in plain values, the paths of downloaded copies by their URLs.
+    ``with_urls`` replaces the paths of downloaded copies by their URLs, in plain values.
     """
     refuse_wrong_paths(arguments.command, arguments.paths)
-    # A route is the way of an extra, such as the stops of an arm. takes() raises a ConfigError for
+    # A route belongs to an extra, such as the stops of an arm. takes() raises a ConfigError for
     # arguments that exclude each other.
     routes = [route for route in ROUTES.values() if route.takes(arguments)]
     if arguments.list:
@@ -230,8 +230,8 @@ def _list_topics(
 ) -> int:
     """Print the topics of a bag, and return the exit code.
 
-    A row has, among others, the mean rate over the whole bag, whether the topic has poses, and the
-    frames of the first messages.
+    Columns include the mean rate over the whole bag, whether the topic has poses, and the frames of
+    the first messages.
     """
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import reading
@@ -288,7 +288,7 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
 
 
 def _table_of_topics(document: "Document") -> list[str]:
-    """Return the lines of the table of topics, with advice below."""
+    """Return the lines of the table of topics, followed by advice."""
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(
         _ROW.format("topic", "type", "count", "rate", "poses", "frames")
@@ -313,11 +313,11 @@ def _table_of_topics(document: "Document") -> list[str]:
 
 
 def _sensor_frames(bag: "PoseBag", topic: str, frame: str) -> list[str]:
-    """Return the frame of a topic's sensor as a list, which is empty if no message names it.
+    """Return the sensor's frame of a topic in a list; empty if no message names a frame.
 
-    ``frame`` is the frame if it is known already, otherwise empty.
+    ``frame`` is the frame if it is already known; otherwise empty.
     """
-    # A damaged message must not hide the other topics.
+    # The other topics must be listed in spite of a damaged message.
     with suppress(InputError):
         frame = frame or bag.sensor_frame(topic)
     return [frame] if frame else []

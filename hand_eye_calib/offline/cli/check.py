@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings about both streams, and return the exit code.
 
-    The code is 1 if a result of these streams would be unusable, else 0.
+    The code is 1 if a result of these streams would be unusable; otherwise 0.
     """
     from hand_eye_calib.core.base.plain import plain
     from hand_eye_calib.core.checks.findings import finding, gravest_first
@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _to_solve(finding: "Finding") -> "Finding":
-    """Return a finding with the options that a calibration uses to repair the streams."""
+    """Return a finding with the options with which a calibration repairs the streams."""
     from hand_eye_calib.core.engine.run import options_to_solve
 
     return replace(finding, options=options_to_solve(finding))
@@ -190,7 +190,7 @@ def _stream_lines(
 
 
 def _verdict(findings: "Sequence[Finding]") -> str:
-    """Return the verdict that a calibration would get, and what to do, in one sentence."""
+    """Return a sentence with the verdict that a calibration would get, and the next step."""
     from hand_eye_calib.core.results.reasons import Verdict
 
     serious = [

@@ -1,6 +1,6 @@
 """Commands that run ``calibrate`` for one kind of input, such as ``arm`` and ``rig``.
 
-Such a command has all arguments of ``calibrate``, and a short help of its own.
+Such a command has all arguments of ``calibrate``, and its own short help.
 """
 
 import argparse
@@ -11,7 +11,7 @@ from hand_eye_calib.offline.cli import calibrate
 
 
 class Job(NamedTuple):
-    """A command that passes its arguments on to ``calibrate``.
+    """Command that passes its arguments to ``calibrate``.
 
     Attributes
     ----------
@@ -20,7 +20,7 @@ class Job(NamedTuple):
     brief : str
         Help that fits on one screen.
     prepare : callable
-        Called with the parsed arguments. Changes them into arguments of ``calibrate``, and raises a
+        Function that converts the parsed arguments to arguments of ``calibrate``. It raises a
         ConfigError if they do not fit the command.
     """
 

@@ -1,8 +1,7 @@
 """``hand_eye_calib COMMAND``: run a command, and turn errors into one line and an exit code.
 
 A command is a module with ``add_arguments(parser)`` and ``run(arguments) -> int``. Only the module
-of the requested command is imported, so that an optional package that is missing disables no other
-command.
+of the requested command is imported. So a missing optional package disables no other command.
 """
 
 import argparse
@@ -75,11 +74,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 def exit_code_of(run: Callable[[], int]) -> int:
     """Run a function that returns an exit code, and return this code.
 
-    If the function raises an error that the user can mend, print the error in one line on stderr,
-    and return the exit code of the error.
+    If the function raises an error that the user can correct, the error is printed in one line on
+    stderr, and its exit code is returned.
     """
-    # Use one thread for linear algebra. The matrices are small: threads would wait for each other,
-    # and take three times as long if other programs use the processor.
+    # Linear algebra uses one thread. The matrices are small, so threads would wait for each other,
+    # and take three times as long on a busy processor.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     limit_memory()
     try:
@@ -103,8 +102,8 @@ def exit_code_of(run: Callable[[], int]) -> int:
             )
         return fail(text)
     except BrokenPipeError:
-        # The program that reads stdout has closed it. Replace stdout, because the interpreter would
-        # raise another error when it flushes stdout at exit.
+        # The program that reads stdout has closed it. Replace stdout; otherwise the interpreter
+        # raises another error when it flushes stdout at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return Exit.BROKEN_PIPE
     except OSError as error:
@@ -117,7 +116,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
 
 
 def named_command() -> int:
-    """Run the command whose name the executable has.
+    """Run the command that is the name of the executable.
 
     ``ros2 run hand_eye_calib replay`` calls the executable ``replay``.
     """
@@ -125,7 +124,7 @@ def named_command() -> int:
     return main([Path(executable).stem, *words])
 
 
-# Message of argparse about a value that is not among the choices of an option.
+# Message of argparse about a value that is not an allowed choice.
 _WRONG_CHOICE = re.compile(r"invalid choice: '([^']*)' \(choose from (.*)\)$")
 
 
@@ -151,8 +150,8 @@ class CommandParser(argparse.ArgumentParser):
 class _ShowHelp(argparse.Action):
     """Action of ``--help``: print the help of a command.
 
-    A command with many options has a brief help that fits on a screen, stored as the default
-    ``brief`` of its parser. ``--help all`` prints all options.
+    A command with many options has a short help that fits on a screen. It is the default ``brief``
+    of the parser. ``--help all`` prints all options.
     """
 
     def __call__(
@@ -221,7 +220,7 @@ def _run(argv: Sequence[str]) -> int:
 def _run_command(module: Any, arguments: argparse.Namespace) -> int:
     """Run a command.
 
-    If the streams of a bag are unclear, the error ends with the command that names the streams.
+    If the streams of a bag are unclear, the error ends with a command that names the streams.
     """
     try:
         return int(module.run(arguments))
@@ -249,7 +248,7 @@ def _add_commands(
     parser: argparse.ArgumentParser,
 ) -> dict[str, argparse.ArgumentParser]:
     """Add all commands to a parser, and return their parsers by name."""
-    # Without ``prog``, argparse would begin the usage of each command with that of the program.
+    # Without ``prog``, the usage of each command would begin with the usage of the program.
     commands = parser.add_subparsers(
         dest="command",
         metavar="COMMAND",
@@ -272,7 +271,7 @@ def _add_commands(
 
 
 def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
-    """Exit with an error about the first unknown option, or else the first unused argument."""
+    """Exit with an error about the first unknown option, or about the first unused argument."""
     options = [word for word in rest if word.startswith("-")]
     first, *_ = [*options, *rest]
     option, _, _ = first.partition("=")
@@ -294,8 +293,8 @@ _SHORT_NAMES = {"-o": "--out", "--topic": "--parent-topic"}
 def _commands_with(option: str) -> dict[str, argparse.ArgumentParser]:
     """Return the parsers of the commands that have an option, by the command's name.
 
-    If the short help of some of these commands lists the option, only these are returned. So are
-    commands with the option in their own examples.
+    If the short help or the own examples of some of these commands contain the option, only these
+    commands are returned.
     """
     owners: dict[str, argparse.ArgumentParser] = {}
     for name, command in COMMANDS.items():
@@ -321,8 +320,8 @@ def _refuse_repeated(
 ) -> None:
     """Exit with an error if an option that takes a value is given twice.
 
-    argparse would keep the last value and ignore the others. ``--prior`` may be repeated, once for
-    each axis; so may options that collect their values, such as ``--label``.
+    argparse would keep the last value and ignore the others. Exceptions are ``--prior``, once for
+    each axis, and options that collect values, such as ``--label``.
     """
     actions = parser._option_string_actions
     names = []
@@ -347,9 +346,9 @@ def _refuse_repeated(
 def _option_of(
     owners: Mapping[str, argparse.ArgumentParser], words: Sequence[str]
 ) -> str:
-    """Return the message about an option of other commands, with the usage of the first command.
+    """Return the message about an option of other commands, with the usage of one of them.
 
-    ``words`` are the option as typed, and the arguments after it.
+    ``words`` has the option as typed, and the arguments after it.
     """
     first, *others = words
     option, equals, _ = first.partition("=")

@@ -4,7 +4,7 @@ The options of the engine are declared once, as the fields of CalibratorConfig. 
 this module makes the options of the command line. All other arguments concern the input and the
 output.
 
-This module imports no library outside of Python, so that ``--help`` is quick.
+To make ``--help`` fast, this module imports only the standard library.
 """
 
 import argparse
@@ -38,7 +38,7 @@ _AXES = ", ".join(
     name.removeprefix("prior.") for name in OPTION_FIELDS if "prior." in name
 )
 
-# Options that most users set. They are in the first group of the help.
+# Options that most users set. They form the first group of the help.
 _COMMON = (
     "method",
     "reference",
@@ -81,7 +81,7 @@ FILE_OPTIONS: dict[str, dict[str, Any]] = {
 # the messages.
 STAMPS = ("header", "receive")
 
-# Names of options of the input that messages of readers contain.
+# Names of input options that appear in the messages of readers.
 _INPUT_OPTIONS = (*FILE_OPTIONS, "pair_by", "stamps")
 _OPTIONS_OF_READERS = {
     *_INPUT_OPTIONS,
@@ -95,9 +95,9 @@ _OPTIONS_OF_READERS = {
 class Exit(IntEnum):
     """Exit codes of the commands.
 
-    FAILED also means bad input. NOT_ALL means that a solve succeeded, but an axis is unobservable
-    or the verdict is DO NOT USE. MOVED means that results differ. INTERRUPTED and BROKEN_PIPE are
-    the codes that a shell reports for SIGINT and SIGPIPE.
+    FAILED also means bad input. NOT_ALL means that the solve succeeded, but an axis is unobservable
+    or the verdict is DO NOT USE. MOVED means that results differ. A shell reports INTERRUPTED after
+    SIGINT and BROKEN_PIPE after SIGPIPE.
     """
 
     GOOD = 0
@@ -118,7 +118,7 @@ _STYLES = {
 
 
 def flag(name: str) -> str:
-    """Return a public option name as the command line has it, without the leading dashes."""
+    """Return the command line's name of a public option, without the leading dashes."""
     return name.replace(".", "-").replace("_", "-")
 
 
@@ -128,7 +128,7 @@ def typed_options(options: Iterable[tuple[str, object]]) -> str:
 
 
 def command_with(typed: Sequence[str], options: Options) -> str:
-    """Return a command with further options, in place of values that it has for these options.
+    """Return a command with further options, which replace its own values of these options.
 
     Parameters
     ----------
@@ -153,12 +153,12 @@ def command_with(typed: Sequence[str], options: Options) -> str:
 
 
 def _flag_with_axis(name: str, value: str) -> tuple[str, str]:
-    """Return the name of a typed option, and the axis of a prior, which may be repeated."""
+    """Return the name of a typed option; for a prior, which may be repeated, with its axis."""
     return name, value.partition("=")[0] if name == "--prior" else ""
 
 
 def as_typed(text: str) -> str:
-    """Return a message of the engine with option names as a user types them.
+    """Return a message of the engine with option names as typed on the command line.
 
     Messages of the engine contain public option names: ``raise max_gap`` becomes ``raise
     --max-gap``.
@@ -203,7 +203,7 @@ def with_progress(
     doing: str,
     size: Callable[[_Item], int] = lambda item: 1,
 ) -> Iterator[_Item]:
-    """Yield items; on a terminal, display the progress and the time left.
+    """Yield items. On a terminal, display the progress and the time left.
 
     Parameters
     ----------
@@ -213,7 +213,8 @@ def with_progress(
     doing : str
         Activity to display.
     size : callable
-        Returns the size of an item, such as its number of bytes. Default: 1 for every item.
+        Function that returns the size of an item, such as its number of bytes. Default: 1 for every
+        item.
     """
     if not sys.stderr.isatty():
         yield from items
@@ -229,9 +230,9 @@ def with_progress(
 
 
 def print_result(lines: Iterable[str], document: object = None) -> None:
-    """Print the result of a command on stdout: the document as JSON, or the lines without one.
+    """Print a result on stdout: the document as JSON if there is one, otherwise the lines.
 
-    On a terminal, a verdict at the beginning of the lines is coloured.
+    On a terminal, a verdict at the start of the lines is coloured.
     """
     if document is None:
         text = "\n".join(map(printable, lines))
@@ -254,7 +255,7 @@ def argument_type(
     """Return a function that argparse can use as the type of an argument.
 
     A ConfigError of ``parse`` becomes an error about wrong usage. ``prefix``, such as the name of
-    the option, is removed from the message, because argparse prints the name itself.
+    the option, is removed from the message, because argparse adds the name.
     """
 
     def parsed(text: str) -> Any:
@@ -286,7 +287,7 @@ def at_least(minimum: int) -> Callable[[str], int]:
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add ``--config`` and an option for every field of CalibratorConfig."""
-    # Values may begin with a minus, such as -1e-3 and -90deg+/-2deg: they are no options.
+    # A word that begins with a minus and a digit is a value, such as -1e-3 or -90deg+/-2deg.
     parser._negative_number_matcher = re.compile(r"-\.?\d")
     group = parser.add_argument_group("calibration options")
     rare = parser.add_argument_group(
@@ -367,7 +368,7 @@ def checked_option(name: str, value: object) -> tuple[str, OptionValue]:
             return name, check_value(
                 field, *quantities(name, [unit], [value], "")
             )
-        # If the text is no number, check_value below reports what is expected.
+        # If the text is not a number, check_value below reports the expected form.
         with suppress(ValueError):
             value = kind(value)
     checked = check_value(field, value)
@@ -444,9 +445,9 @@ def sources_from(arguments: argparse.Namespace) -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        "parent" and "child": topic, with its fields or target after a question mark, or frames
-        WORLD:SENSOR. "parent_stamps" and "child_stamps": one of ``STAMPS``. What the user has not
-        named is absent.
+        "parent" and "child": topic, with fields or target after a question mark, or frames
+        WORLD:SENSOR. "parent_stamps" and "child_stamps": one of ``STAMPS``. Keys that the user has
+        not named are missing.
 
     Raises
     ------
@@ -502,7 +503,7 @@ def add_json_argument(
 
 
 def _path(text: str) -> Path | str:
-    """Return a path. A URL stays a text, because a Path would drop one of its two slashes."""
+    """Return a path. A URL stays a text, because a Path would remove one of its two slashes."""
     if "://" in text:
         return text
     try:

@@ -1,6 +1,6 @@
-"""Paths that a user gives by mistake: a saved result, two names in one argument, files to replay.
+"""Paths that a user passes by mistake: a saved result, two names in one argument, files to replay.
 
-Each of them gets an error with the command that the user meant.
+Each error contains the command that the user probably wants.
 """
 
 import re
@@ -23,7 +23,7 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
     Raises
     ------
     ConfigError
-        If an argument holds the names of two files, or files are given to ``replay``.
+        If an argument contains the names of two files, or if ``replay`` gets files.
     InputError
         If a path is a saved result.
     """
@@ -55,9 +55,9 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
 
 
 def calibrating(words: Sequence[str]) -> str:
-    """Return the command line for arguments that begin with a file instead of a command.
+    """Return the command for arguments that begin with a file instead of a command.
 
-    The result is empty if the first word is no existing file or folder.
+    The result is empty unless the first word is an existing file or folder.
     """
     first = Path(words[0])
     if not first.exists():

@@ -1,4 +1,4 @@
-"""Output of a calibration: a text for people, JSON for programs, and the exit code."""
+"""Output of a calibration: text for people, JSON for programs, and an exit code."""
 
 import argparse
 import textwrap
@@ -79,7 +79,7 @@ def deliver(
     bag : pathlib.Path, optional
         Bag whose transforms may contain the frame of ``--base-frame``.
     pictures : sequence of callable
-        Functions that draw further figures of the report from the calibration.
+        Functions that draw further figures of the report, given the calibration.
     """
     if (
         arguments.installed or arguments.base_frame
@@ -103,7 +103,7 @@ def deliver(
     try:
         lines = as_lines(calibration, steps, arguments.verbose, is_scale_free)
         print_result(lines, document)
-    # Write the report even if the program that reads stdout has closed it.
+    # Write the report even if stdout was closed.
     finally:
         if arguments.out:
             note(written)
@@ -134,12 +134,12 @@ def _saved(calibration: Calibration, directory: Path, inputs: Document) -> str:
 def _with_robot(
     calibration: Calibration, arguments: argparse.Namespace, bag: Path | None
 ) -> Calibration:
-    """Return the calibration with the comparison and the base frame that the user requests.
+    """Return the calibration with the requested comparison and base frame.
 
     Raises
     ------
     ConfigError
-        If nothing contains the base frame.
+        If the base frame is in none of the sources.
     """
     from hand_eye_calib.core.assessment.comparison import with_comparison
     from hand_eye_calib.formats.installed import (
@@ -210,7 +210,7 @@ def as_lines(
     The lines are, in this order: verdict and reasons, the extrinsic in both directions, the next
     steps, the command that publishes the extrinsic, and details such as the comparison with the
     installed extrinsic. ``with_details`` adds quaternions and facts about the solution.
-    ``is_scale_free`` says that the user had the scale estimated.
+    ``is_scale_free`` states that the scale was estimated at the user's request.
     """
     lines = [
         *verdict_lines(calibration),
@@ -240,11 +240,11 @@ def as_lines(
 
 
 def publish_lines(calibration: Calibration) -> list[str]:
-    """Return the command that publishes an extrinsic; no lines if it must not be used."""
+    """Return the command that publishes an extrinsic, or no lines if it must not be used."""
     command = calibration.static_transform_command()
     if not command:
         return []
-    # An unknown number of the command is a text, such as X, which the user must replace.
+    # An unknown number in the command is a text, such as X, for the user to replace.
     by_hand = [
         number
         for number in usable_numbers(calibration).values()
@@ -300,9 +300,9 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
 def _clock_and_scale_lines(
     calibration: Calibration, is_scale_free: bool
 ) -> list[str]:
-    """Return the estimated time offset and the scale, which users of the child's data need.
+    """Return the lines about time offset and scale, which users of the child's data need.
 
-    A scale near 1 is left out unless the user had it estimated.
+    A scale near 1 is left out, unless it was estimated at the user's request.
     """
     lines = []
     child = calibration.child_frame
@@ -331,7 +331,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
     yield calibration.headline
     in_headline = calibration.reasons_in_headline
     for number, reason in enumerate(shown(calibration.reasons)):
-        # If the headline contains the sentence of the first reason, only the advice follows.
+        # The headline may contain the sentence of the first reason. Then only its advice follows.
         if number or reason not in in_headline:
             yield from wrapped(reason.sentence, "- ", "  ")
         yield from wrapped(
@@ -342,7 +342,7 @@ def verdict_lines(calibration: Calibration) -> Iterator[str]:
 
 
 def wrapped(text: str, first: str, others: str) -> list[str]:
-    """Return the lines of a text; ``first`` and ``others`` are the beginnings of the lines."""
+    """Return the lines of a wrapped text. ``first`` and ``others`` begin its lines."""
     return textwrap.wrap(
         printable(as_typed(text)),
         _WIDTH,
@@ -364,7 +364,7 @@ def next_steps(
     options: dict[str, object] = {}
     for reason in shown(calibration.reasons):
         options |= reason.options
-    # A command with a value that is still to be measured would not run.
+    # A command with a value that the user must still measure would not run.
     options = {
         name: value for name, value in options.items() if value != PLACEHOLDER
     }
@@ -406,7 +406,7 @@ def _missing_motion(
 
 
 def allowance_lines(calibration: Calibration) -> list[str]:
-    """Return lines about the allowance in the printed standard deviations; none without one."""
+    """Return lines about the allowance in the printed standard deviations, if there is one."""
     words = allowance_in_words(calibration)
     return wrapped(f"+/- is 1 sigma; {words}", "  ", "  ") if words else []
 
@@ -419,7 +419,7 @@ def transform_lines(
     """Yield a row for each number of a transform, with the parts of its standard deviation."""
     parts = parts_of_sigmas(transform)
     for axis, number in printed_numbers(transform, out_of_reach).items():
-        # Three axes at once, such as "x, y, z", have a text in place of a number.
+        # A row for three axes, such as "x, y, z", has a text instead of a number.
         if "," in axis:
             yield f"  {axis} are {number}"
         else:
@@ -449,7 +449,7 @@ def compact_lines(
 def _column(
     numbers: Mapping[str, str], axes: Sequence[str], width: int
 ) -> list[str]:
-    """Return the column of three axes; a text about all three axes is in the second row."""
+    """Return the column of three axes. A text about all of them is in the second row."""
     if text := numbers.get(listing(axes)):
         return ["", f"{listing(axes)} are {text}", ""]
     return [f"{axis:<{width}} {numbers[axis]:>24}" for axis in axes]

@@ -92,13 +92,13 @@ def _ignored_options(config: CalibratorConfig, method: str) -> list[str]:
 
 
 def are_bags(paths: Sequence[Path | str]) -> bool:
-    """Return True if all paths are bags, False if all are trajectory files. A URL is a bag.
+    """Return True if all paths are bags, and False if all are trajectory files. URLs are bags.
 
     Raises
     ------
     ConfigError
-        If only some paths are bags, if there is only one trajectory file, or if a path appears
-        twice.
+        If bags and other paths are mixed, if there is only one trajectory file, or if a path is
+        repeated.
     """
     refuse_repeated_paths(paths)
     urls = [path for path in paths if isinstance(path, str)]
@@ -108,7 +108,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
         if isinstance(path, Path) and _looks_like_bag(path)
     ]
     n_bags = len(urls) + len(local_bags)
-    # A single path that does not exist is opened as a bag, which reports the error.
+    # If a single path does not exist, opening it as a bag reports the error.
     if n_bags == len(paths) or (
         len(paths) == 1 and not Path(paths[0]).is_file()
     ):
@@ -162,7 +162,7 @@ def is_plain_file(path: Path | str) -> bool:
 
 
 def _looks_like_bag(path: Path) -> bool:
-    """Whether a path is a folder or a bag's file, by its name."""
+    """Return whether a path is a folder, or has the name of a bag's file."""
     return has_suffix_of_bag(path) or path.is_dir()
 
 
@@ -206,16 +206,16 @@ def read_files(
     options: Options,
     streams: Sequence[str] = STREAMS,
 ) -> FilesRead:
-    """Read trajectory files; print notes on what was recognised from their content.
+    """Read trajectory files. Print notes about what was recognised from their content.
 
     Parameters
     ----------
     arguments : argparse.Namespace
         Options of the files. With two files, an option of one file, such as ``--child-format``,
-        overrides the option of both files, ``--format``.
+        overrides the option of both, ``--format``.
     paths : sequence of path-like
     options : dict
-        Options of the engine. Only "parent_measures" and "child_measures", the kinds of data, are
+        Options of the engine. Only the kinds of data, "parent_measures" and "child_measures", are
         used.
     streams : sequence of str
         Stream of each path, if there are at most two.
@@ -261,7 +261,7 @@ def _with_option_of_file(
 ) -> str:
     """Return a message that begins with a path, with the options of the file in `columns`' place.
 
-    The option of both files is replaced by that of this file, if the file has a stream.
+    If the file has a stream, the message contains the option of this file instead of both files.
     """
     for path, stream in zip(paths, streams, strict=True):
         if stream and text.startswith(str(path)):

@@ -39,7 +39,7 @@ def write_report(
     interface : Interface
         Interface of the user, which decides the spelling of options.
     pictures : sequence of callable
-        Functions that draw further figures from the result.
+        Functions that draw further figures, given the result.
     """
     from hand_eye_calib.offline.report.report import render
 
@@ -59,8 +59,8 @@ def write_page(directory: Path, page: Callable[[], str]) -> None:
 def write_session_report(directory: Path, session: SessionResult) -> None:
     """Check the streams of a session, then write its result and its report with the findings.
 
-    The last check of the session may be older than its result, so the check is repeated. Without
-    the option ``report``, nothing is written.
+    The check is repeated, because the last check of the session may be older than its result.
+    Without the option ``report``, nothing is written.
     """
     if not session.with_report:
         return

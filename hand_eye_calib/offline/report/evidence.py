@@ -1,4 +1,4 @@
-"""Evidence for a result in its report: both paths, motion, and both streams before any solve."""
+"""Evidence for a result in its report: both paths, motion, and both streams before the solve."""
 
 from dataclasses import dataclass, replace
 
@@ -16,12 +16,13 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.document import UNKNOWN_M
 
-# Shortest step (s) of which the length of a path is summed. Shorter steps would sum the noise.
+# Shortest step (s) in the length of a path. Shorter steps would add up noise.
 _MIN_PATH_STEP_S = 0.2
 
-# Largest ratio of the variance of positions across the plane of motion to the smaller variance in
-# it, and least cosine between an axis and the normal of this plane (30 deg). Both are choices.
+# A motion is in a plane if the variance of positions across it is at most this multiple of the
+# smaller variance in it. Chosen, not measured.
 _MAX_FLAT = 0.25
+# Smallest cosine between an axis and the normal of this plane (30 deg). Chosen, not measured.
 _MIN_UPRIGHT = 0.87
 
 # Largest number of samples of the rates of a stream.
@@ -85,7 +86,7 @@ def summarise(trajectory: Trajectory) -> StreamSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamView:
-    """Angular rates or speeds of the parent and of the child, in this order, before any solve.
+    """Angular rates or speeds of both streams before the solve: first the parent, then the child.
 
     Times are on the parent's clock, lengths in the parent's unit.
 
@@ -121,27 +122,27 @@ class StreamView:
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What the figures of a report draw, besides the Calibration.
+    """Data that the figures of a report draw, in addition to the Calibration.
 
     Attributes
     ----------
     times_s : (N,) array
         Times of both paths (s).
     parent, child : (N, 3) arrays
-        Two paths of one sensor (m), from the parent's stream and from the child's stream. One path
-        is measured by this sensor, the other is computed from the other stream and the result. The
-        sensor is the parent, or the sensor that has positions without orientations. The paths are
-        in this sensor's world and begin at its first position.
+        Two paths of one sensor (m): from the parent's stream, and from the child's stream. One path
+        is measured by the sensor; the other is computed from the other stream and the result. The
+        sensor is the one that has positions without orientations, or else the parent. The paths are
+        in the world of this sensor and begin at its first position.
     angles : 2 x (N, 3) arrays, or None
         Angles (rad) by which the parent has turned about its own x, y and z since its first pose:
-        as measured, and as computed from the child's stream. The difference of both is the rotation
-        vector between the measured and the computed pose. None if a stream does not measure poses.
+        measured, and computed from the child's stream. Their difference is the rotation vector
+        between the measured and the computed pose. None if a stream does not measure poses.
     excitation : Excitation
         Motion of the sensors.
     streams : StreamView
         Rates of both streams.
     without_lever_arm : (N, 3) array, or None
-        The computed path if both sensors were at one place (m). None unless a sensor has positions
+        Computed path (m) as if both sensors were at one place. None unless a sensor has positions
         without orientations.
     has_positions_of_parent : bool
         Whether the parent has positions without orientations.
@@ -163,7 +164,7 @@ class Evidence:
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     """Compute the evidence for a result from its poses and options."""
     config = snapshot.config
-    # The clock offset is known from the result: a second estimate would take time.
+    # The result contains the clock offset, so it is not estimated again.
     settled = replace(config, time_offset=calibration.time_offset_s)
     pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(
         calibration.scale
@@ -205,7 +206,7 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
 def view_streams(
     parent: Trajectory, child: Trajectory, max_gap_s: float
 ) -> StreamView:
-    """Return the rates of two trajectories that are on one clock and in one unit of length."""
+    """Return the rates of two trajectories on one clock and in one unit of length."""
     start_ns = min(parent.stamps_ns[0], child.stamps_ns[0])
     longest_s = max(parent.duration_s, child.duration_s)
     step_s = max(parent.interval_s, child.interval_s, longest_s / _MAX_RATES)
@@ -219,8 +220,8 @@ def view_streams(
         )
         first_s = (stream.stamps_ns[0] - start_ns) * 1e-9
         rates.append((first_s + np.arange(len(values)) * step_s, values))
-        # Each gap ends a span and begins the next one. So the sorted edges are pairs of start and
-        # end.
+        # A gap is the end of one span and the start of the next. So the sorted edges are pairs of
+        # start and end.
         gaps = np.flatnonzero(
             are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s)
         )
@@ -240,8 +241,8 @@ def _paths_of_positions(
     """Return three paths (N, 3) of the sensor with positions, m.
 
     The first path is measured, and begins at 0. The second path is computed from the poses of the
-    other sensor and the result, the third path from these poses alone. Both are fitted to the
-    measured path by a rotation and a translation.
+    other sensor and the result. The third path is computed from these poses alone. The second and
+    third path are fitted to the first by a rotation and a translation.
     """
     if parent_is_positions:
         poses = pose_pairs.Ts_cw_c
@@ -269,7 +270,7 @@ def moved_onto(measured: FloatArray, path: FloatArray) -> FloatArray:
 def _paths_of_poses(
     calibration: Calibration, pose_pairs: PosePairs
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the path (N, 3) of the parent as measured, and as computed from the child's stream.
+    """Return the path (N, 3) of the parent: measured, and computed from the child's stream.
 
     The measured path begins at 0. The computed path is fitted to it by the mean rotation between
     the worlds and by the median difference.
@@ -295,12 +296,12 @@ def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
 def _angles(
     calibration: Calibration, pose_pairs: PosePairs
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the angles (N, 3) turned about the parent's axes as measured, and as computed.
+    """Return the angles (N, 3) turned about the parent's axes: measured, and computed.
 
-    The measured angles (rad) are the sum of the rotation vectors from pose to pose. They have no
-    singularity, unlike roll, pitch and yaw at a pitch of 90 deg. The computed angles are
-    the measured angles plus the rotation vector that leads from the measured pose to the pose
-    computed from the child's stream and the result.
+    The measured angles (rad) are sums of the rotation vectors from pose to pose. Unlike roll, pitch
+    and yaw, they are not singular at a pitch of 90 deg. The computed angles are the measured angles
+    plus a rotation vector: from the measured pose to the pose that is computed from the child's
+    stream and the result.
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)
@@ -316,9 +317,9 @@ def turning_part(
 ) -> slice:
     """Return the part of a path (N, 3) in which the sensor turns most.
 
-    It is the part with the largest ratio of its length to the distance of its ends, among parts
-    that are not shorter than half the median. Its duration is a tenth of that of the path, or
-    ``least_s`` if that is longer.
+    It is the part with the largest ratio of its length to the distance of its ends. Parts shorter
+    than half of the median length are left out. Its duration is a tenth of the path's duration, and
+    at least ``least_s``.
     """
     duration_s = max(times_s[-1] / 10, least_s)
     ends = np.searchsorted(times_s, times_s + duration_s)
@@ -326,7 +327,7 @@ def turning_part(
     if not len(starts):
         return slice(0, len(times_s))
     ends = ends[starts]
-    # Steps between poses that are apart sum the motion, not the noise.
+    # Steps between distant poses add up the motion instead of the noise.
     stride = max(1, round(_MIN_PATH_STEP_S / median(np.diff(times_s))))
     way = np.r_[
         0.0, np.cumsum(np.linalg.norm(np.diff(path[::stride], axis=0), axis=1))
@@ -342,15 +343,15 @@ def turning_part(
 
 
 def _is_upright(poses: FloatArray) -> bool:
-    """Return whether z of a sensor with ``poses`` (N, 4, 4) is near its normal of motion."""
+    """Return whether z of a sensor with ``poses`` (N, 4, 4) is near the normal of its plane."""
     return upward_normal(poses) is not None
 
 
 def upward_normal(poses: FloatArray) -> FloatArray | None:
     """Return the normal (3,) of the plane in which a sensor moves, on the side of its z axis.
 
-    ``poses`` (N, 4, 4) are those of the sensor in its world. The result is None if the sensor
-    moves in all directions, or if its z axis is not near the normal.
+    ``poses`` (N, 4, 4) are poses of the sensor in its world. The result is None if the sensor moves
+    in all directions, or if its z axis is not near the normal.
     """
     variances, axes = np.linalg.eigh(np.cov(se3.translation_of(poses).T))
     normal = axes[:, 0]
@@ -378,7 +379,8 @@ def spread_of_position(
     is_unknown = ~np.isfinite(sigmas_m)
     covariance = calibration.covariance[:3, :3]
     if np.isfinite(covariance).all():
-        # An unknown direction need not be along an axis: it is an eigenvector with a huge variance.
+        # An unknown direction need not be parallel to an axis. It is an eigenvector with a huge
+        # variance.
         R = se3.rotation_of(calibration.T_parent_child)
         variances, directions = np.linalg.eigh(R @ covariance @ R.T)
         is_huge = (variances > UNKNOWN_M**2) & is_unknown.any()

@@ -1,6 +1,6 @@
 """Draw the figures of the report, each with a caption in words and numbers.
 
-A caption only states sizes. The verdict has rules of its own.
+A caption only states sizes. The verdict has its own rules.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ UNITS = {
     "x": (100.0, "translation (cm)"),
     "yaw": (180 / np.pi, "rotation (deg)"),
 }
-# The same for the stops of an arm, whose table has millimetres, too.
+# The same for the stops of an arm, because their table has millimetres.
 _UNITS_OF_STOPS = {**UNITS, "x": (1000.0, "translation (mm)")}
 
 _AXIS_LABELS = ("x (m)", "y (m)", "z (m)")
@@ -76,7 +76,7 @@ def figures_of(
     figures = []
     titles = _titles_of_views(evidence)
     if calibration.reference == "windows":
-        # The path of the wheels has nominal radii. It is no pose that can be compared.
+        # The path of the wheels has nominal radii, so it is not comparable.
         evidence = None
     if calibration.measured != "rotations":
         figures.append(figure_of_views([calibration], titles))
@@ -109,7 +109,7 @@ def figures_of(
 
 
 def _titles_of_views(evidence: Evidence | None) -> dict[str, str]:
-    """Return the titles of the three views: directions of a vehicle only where they are true."""
+    """Return the titles of the three views. They name directions of a vehicle only for vehicles."""
     if evidence is None or not evidence.is_upright:
         return VIEWS
     if evidence.excitation.has_vehicle_axes:
@@ -133,7 +133,7 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
         columns = ["xyz".index(axis) for axis in axes]
         points = positions[:, columns]
         ends = (positions + line_m * directions)[:, columns]
-        # (2, 2, N): axis of the view, start or end, stop. So each stop is a line of its own.
+        # (2, 2, N): axis of the view, start or end, stop. Each stop is a separate line.
         directed = np.stack([points, ends], axis=1).T
         panel.plot(*directed, color=MUTED, lw=0.7)
         panel.plot(
@@ -160,7 +160,7 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
 
 @page_style()
 def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
-    """Draw the rates of both streams over time, before any solve, and bars where there are poses.
+    """Draw the rates of both streams over time before the solve, and bars where poses exist.
 
     ``names`` are the names of parent and child.
     """
@@ -235,15 +235,15 @@ def _name_plane(plane: Axes, first: int, second: int) -> None:
 
 
 def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
-    """Draw both paths of one sensor in the plane of motion, and across this plane over time."""
+    """Draw both paths of a sensor: in the plane of motion, and across this plane over time."""
     rows = _downsample(len(evidence.times_s))
     factor, unit = _time_axis(evidence.times_s[-1])
     first, second, across = _axes_of_motion(evidence.parent)
     figure, (plane, side) = make_panels(3.75, 1, 2)
     parent = calibration.parent_frame
     child = calibration.child_frame
-    # One sensor has measured its path. The path of the same sensor is also computed from the poses
-    # of the other sensor and the result.
+    # One path is measured by a sensor. The other path of the same sensor is computed from the other
+    # sensor's poses and the result.
     if (
         calibration.measured == "positions"
         and not evidence.has_positions_of_parent
@@ -373,10 +373,10 @@ class _Positions(NamedTuple):
 def _figure_of_track(
     calibration: Calibration, evidence: Evidence, without_lever_arm: FloatArray
 ) -> Drawn:
-    """Draw the sharpest turn of the track enlarged, and its distances from computed positions.
+    """Draw the sharpest turn of the track enlarged, and distances from computed positions.
 
     ``without_lever_arm`` (N, 3) are the positions of the other sensor, m. In the turn, both
-    computed paths are moved onto the measured one, so that drift is not visible.
+    computed paths are fitted to the measured path, so that drift is not visible.
     """
     measured, computed, sensor, other = _Positions.of(calibration, evidence)
     part = turning_part(measured, evidence.times_s, LOOK.min_turn_s)
@@ -434,7 +434,7 @@ def _figure_of_positions(
 ) -> Drawn:
     """Draw the measured positions over time, and their differences from computed positions.
 
-    The differences are those with the result, and those ``without_lever_arm`` (N, 3), m.
+    There are two differences: with the result, and ``without_lever_arm`` (N, 3), m.
     """
     measured, computed, sensor, other = _Positions.of(calibration, evidence)
     before = without_lever_arm - measured
@@ -465,7 +465,8 @@ def _figure_of_residuals(
     calibration: Calibration, residuals: Residuals
 ) -> Drawn:
     """Draw the sizes of the residuals of a result, translations above rotations."""
-    # The keys are those of UNITS. Without positions or orientations, there is only one kind.
+    # The keys are those of UNITS. Streams without positions, or without orientations, have one kind
+    # only.
     sizes = {"x": residuals.translation_m, "yaw": residuals.rotation_rad}
     if calibration.measured == "rotations":
         del sizes["x"]
@@ -529,7 +530,7 @@ def _draw_residuals(
 ) -> None:
     """Draw the sizes (K,) of residuals, all positive, and mark the outliers.
 
-    If there are too many, every n-th used residual and the largest outliers are drawn.
+    If there are too many points, every n-th used residual and the largest outliers are drawn.
     """
     dots = np.flatnonzero(~is_out)
     crosses = np.flatnonzero(is_out)

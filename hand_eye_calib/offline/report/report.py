@@ -71,12 +71,12 @@ _AXIS_NAMES = {
     "yaw": "about z (yaw)",
 }
 
-# Frames of sensors that have no name of their own.
+# Frames of sensors that have no name.
 _DEFAULT_FRAMES = ("parent_sensor", "child_sensor")
-# Names of the figures at the top of the page. All other figures are in the section Evidence.
+# Figures at the top of the page. All other figures are in the section Evidence.
 _TOP_FIGURES = ("views", "track", "trajectories")
 
-# Space in a command before an option. A line of the page breaks only there.
+# Space before an option in a command. The page may break lines only there.
 _OPTION_BEGINS = re.compile(r" (?=--)")
 
 _FOLDER = Path(__file__).parent / "templates"
@@ -104,7 +104,7 @@ _TEMPLATES.globals["axis_names"] = _AXIS_NAMES
 
 @cache
 def _template(path: Path) -> jinja2.Template:
-    """Return a compiled template, which may extend or import the templates of this package."""
+    """Return a compiled template. It may extend or import other templates of this package."""
     return _TEMPLATES.from_string(path.read_text(encoding="utf-8"))
 
 
@@ -202,7 +202,7 @@ def render(
 
 
 def _numbers(calibration: Calibration, interface: Interface) -> dict[str, Any]:
-    """Return the transforms of a result, and the functions that write their numbers."""
+    """Return the transforms of a result, and the functions that format their numbers."""
     return {
         "directions": [*transforms_of(calibration).values()][:2],
         "others": _other_transforms(calibration),
@@ -221,7 +221,7 @@ def _drawn(
     snapshot: Snapshot | None,
     pictures: Sequence[Callable[[Calibration], list[Drawn]]],
 ) -> list[Drawn]:
-    """Return the further figures of a result: those of the caller, and those of extras."""
+    """Return the further figures of a result, from the caller and from extras."""
     drawings = []
     for draw in pictures:
         drawings += draw(calibration)
@@ -231,7 +231,7 @@ def _drawn(
 def pictures_of_extras(
     calibration: Calibration, snapshot: Snapshot | None, suffix: str = ""
 ) -> list[Drawn]:
-    """Return the figures of all extras; their names end in ``suffix``."""
+    """Return the figures of all extras. Their names end in ``suffix``."""
     figures = []
     for draw in REPORT_PICTURES.values():
         figures += draw(calibration, snapshot, suffix)
@@ -239,7 +239,7 @@ def pictures_of_extras(
 
 
 def _advice(calibration: Calibration, evidence: Evidence | None) -> str:
-    """Return what the user should do next: motion that is missing, and what the reasons ask for."""
+    """Return the next steps of the user: motion that is missing, and advice in the reasons."""
     advice = []
     if evidence and calibration.verdict is not Verdict.DO_NOT_USE:
         advice.append(what_is_missing(evidence.excitation, calibration))
@@ -282,7 +282,7 @@ def _other_transforms(
 
 
 def _kind_of_result(calibration: Calibration) -> str:
-    """Return "Pose", or "Position" or "Orientation" if the streams determine only this part."""
+    """Return "Pose"; "Position" or "Orientation" if the streams determine only this part."""
     unknown = {*calibration.out_of_reach}
     if unknown >= {*ROTATIONS}:
         return "Position"
@@ -305,26 +305,26 @@ def _with_sensor_names(
 
 
 def _sensor_name(frame: str, origin: Document) -> str:
-    """Return the frame of a sensor; its topic or file if the frame is a default name."""
+    """Return the frame of a sensor; if it is a default name, its topic or file."""
     source = str(origin.get("topic") or Path(str(origin.get("file", ""))).stem)
     return source if frame in _DEFAULT_FRAMES and source else frame
 
 
 def _at_distance(calibration: Calibration) -> str:
-    """Return a sentence about the position error of an object that the child sensor measures.
+    """Return a sentence about the position error of an object seen by the child sensor.
 
     The sentence is empty if a standard deviation is unknown, or if the result must not be used.
     """
     is_bad = calibration.verdict is Verdict.DO_NOT_USE
     if is_bad or not np.isfinite(calibration.sigmas).all():
         return ""
-    # The objects of an arm are near, and its stops have no errors of an odometry.
+    # The objects of an arm are near, and its stops have no errors of odometry.
     are_stops = calibration.reference == "stops"
     distance_m = LOOK.near_object_m if are_stops else LOOK.object_m
     errors = ""
     if not are_stops:
         errors = ", constant odometry errors included"
-    # The object is on an axis of the child sensor. The direction with the largest error counts.
+    # Put the object on each axis of the child sensor, and use the direction with the largest error.
     variances = []
     for point in distance_m * np.eye(3):
         # Derivative of the object's position with respect to the error of the pose.
@@ -340,7 +340,7 @@ def _at_distance(calibration: Calibration) -> str:
 
 
 def _targets(calibration: Calibration) -> str:
-    """Return the targets of translation and rotation, and those of axes with their own target."""
+    """Return the targets of translation and rotation, and different targets of single axes."""
     targets = [
         text.length(calibration.target_translation),
         text.angle(calibration.target_rotation),
@@ -453,7 +453,7 @@ def _stream(
 ) -> dict[str, str]:
     """Return the row of a stream: source, poses, duration, rate, longest gap and path length.
 
-    A value that is not known is "-".
+    An unknown value is "-".
     """
     count = origin.get("messages", origin.get("poses"))
     row = {
@@ -471,8 +471,8 @@ def _stream(
         if duration_s:
             row["duration"] = text.duration(duration_s)
             row["rate"] = f"{(count - 1) / duration_s:.1f} Hz"
-    # The stream of a bag contains only the poses of pairs, and only the newest of a long bag. Then
-    # its gaps are not the gaps of the topic, and the values of ``origin`` stay.
+    # The stream from a bag contains only the poses of pairs; from a long bag, only the newest. Its
+    # gaps are then not the gaps of the topic, so the values of ``origin`` are kept.
     if stream is not None and len(stream) >= max(2, count or 0):
         whole = summarise(stream)
         count = len(stream)

@@ -1,7 +1,7 @@
 """The look of all figures: colours, sizes and fonts, and their conversion to elements of a page.
 
-All figures are light, in colours that colour-blind people can distinguish. They are made without
-pyplot, so they need no display and no global state.
+All figures have light backgrounds, and colours that colour-blind people can distinguish. They are
+made without pyplot, so they need no display and no global state.
 """
 
 import io
@@ -23,8 +23,8 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import printable
 from hand_eye_calib.core.base.plain import Document
 
-# Colours as they are drawn. In a page, variables of the style sheet replace them, so that a dark
-# page has lighter colours.
+# Colours of the figures. In a page, variables of the style sheet replace them, so that a dark page
+# has lighter colours.
 INK = "#1b1f24"
 MUTED = "#5c6670"
 GRID = "#d9dee3"
@@ -55,10 +55,10 @@ class Look(NamedTuple):
     axis_share : float
         Length of a sensor's axes as a share of the distance between the sensors.
     min_distance_m : float
-        Smallest distance (m) in the length of the axes: sensors that are nearer have axes as if
-        they had this distance.
+        Smallest distance (m) from which the length of the axes is computed. For nearer sensors the
+        axes have the same length.
     object_m : float
-        Distance of the object for which the error of its position is stated (m).
+        Distance (m) of the object whose position error is stated.
     near_object_m : float
         The same distance for the camera of an arm (m).
     bar_decades : float
@@ -66,8 +66,8 @@ class Look(NamedTuple):
     decades_above : float
         Part of this scale above the target, in powers of ten.
     min_in_view : float
-        Length, in a view, of a unit vector along an unknown direction. If it is shorter, the
-        direction is nearly perpendicular to the view, and its line is not drawn.
+        An unknown direction is drawn only if the length of its unit vector in a view exceeds this.
+        Otherwise it is nearly perpendicular to the view.
     max_points : int
         Largest number of points of a line, and of single dots.
     max_coordinate_points : int
@@ -131,7 +131,7 @@ _STYLE: Document = {
     "legend.frameon": False,
     "lines.linewidth": 1.5,
     "path.simplify_threshold": 0.3,
-    # A fixed salt instead of a random one, so that equal figures have equal files.
+    # A fixed salt, so that equal figures have equal files.
     "svg.hashsalt": "hand_eye_calib",
     "svg.fonttype": "none",
 }
@@ -141,15 +141,14 @@ _STYLE: Document = {
 def page_style(**more: Any) -> Iterator[None]:
     """Draw in the style of HTML pages inside the block.
 
-    The user's own settings of Matplotlib have no effect. ``more`` are further settings, with an
-    underscore for each dot in their names.
+    The user's own settings of Matplotlib have no effect. ``more`` has further settings, whose names
+    have underscores instead of dots.
     """
     changed = {name.replace("_", "."): value for name, value in more.items()}
     defaults: Any = matplotlib.rcParamsDefault
     context: Any = matplotlib.rc_context
     with context({**defaults, **_STYLE, **changed}), warnings.catch_warnings():
-        # A character may be missing in Matplotlib's font: the browser draws the text with its own
-        # fonts.
+        # Matplotlib's font may lack a character. The browser draws it with its own fonts.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         yield
 
@@ -164,9 +163,9 @@ class Drawn:
         Name of the HTML element.
     title, caption : str
     svg : str
-        Empty if there is nothing to draw, and only the caption is shown.
+        Empty if there is only a caption.
     key : tuple of (str, str)
-        Colours, as variables of the style sheet, and their names. The page writes them above the
+        Colours as variables of the style sheet, with their names. The page puts them above the
         figure, where they are visible on a narrow screen.
     """
 
@@ -186,9 +185,9 @@ def as_drawn(
 ) -> Drawn:
     """Return a figure as SVG that fits into a page.
 
-    The SVG is scaled by the page, has the colours of the page, and has ids that begin with the name
-    of the figure, so that two figures never share an id. ``lines`` are lines of Matplotlib, whose
-    colours and labels become the key of the figure.
+    The page scales the SVG and sets its colours. All ids begin with the name of the figure, so that
+    two figures never share an id. ``lines`` are lines of Matplotlib; their colours and labels
+    become the key of the figure.
     """
     buffer = io.StringIO()
     no_metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
@@ -201,7 +200,7 @@ def as_drawn(
     svg = re.sub(
         r'<!--.*?-->|(?<=\n) +| xmlns(:\w+)?="[^"]*"', "", svg, flags=re.DOTALL
     )
-    # Remove the ids of groups, which nothing refers to. All other ids get the name of the figure.
+    # Remove the ids of groups, to which nothing refers. Prefix other ids with the figure's name.
     svg = re.sub(r'<g id="[^"]*"', "<g", svg)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = svg.replace('xlink:href="#', f'href="#{name}-')
@@ -209,7 +208,7 @@ def as_drawn(
     svg = re.sub(
         r"(font: [\d.]+px|font-family:) [^;\"]*", r"\1 var(--sans)", svg
     )
-    # Coordinates of the elements path and use have two decimals: that is enough.
+    # Two decimals are sufficient for the coordinates of the elements path and use.
     svg = re.sub(
         r"<[pu][^>]*>",
         lambda shape: re.sub(r"(\.\d\d)\d+", r"\1", shape[0]),
@@ -233,10 +232,10 @@ _SHORTEST_AXIS_DAYS = 1.0 / 24.0
 def recordings_axis(
     panels: Sequence[Axes], stamps_ns: Sequence[int], name: str
 ) -> FloatArray:
-    """Return the places (N,) of recordings on the x axis of panels that share it, and label it.
+    """Return the places (N,) of recordings on the shared x axis of panels, and label this axis.
 
-    The axis is the time from the first to the last start. It has the number of each recording if
-    all starts are within a minute.
+    The axis is the time from the first to the last start. If all starts are within a minute, it has
+    the number of each recording.
 
     Parameters
     ----------
@@ -244,7 +243,7 @@ def recordings_axis(
     stamps_ns : sequence of int
         Start of each recording (ns), in order of time.
     name : str
-        What a number counts, such as "recording".
+        What is counted, such as "recording".
     """
     days = date2num(np.array(stamps_ns, dtype="datetime64[ns]"))
     first = float(days.min(initial=np.inf))
@@ -268,8 +267,8 @@ def recordings_axis(
 def plain_label(label: str) -> str:
     """Return a name that Matplotlib draws as it is.
 
-    A dollar sign would begin a formula. A leading underscore would hide the name from the legend,
-    so a zero-width space precedes it.
+    A dollar sign would begin a formula. A leading underscore would remove the name from the legend,
+    so a zero-width space is inserted before it.
     """
     text = printable(label).replace("$", r"\$")
     return f"\u200b{text}" if text.startswith("_") else text
@@ -285,7 +284,7 @@ def make_panels(
 ) -> tuple[Figure, Sequence[Axes]]:
     """Make a figure with rows and columns of panels, and return the figure and its panels.
 
-    Margins are fixed, because measuring the text takes more time than all other steps.
+    Margins are fixed: measuring the text would take more time than all other steps.
 
     Parameters
     ----------

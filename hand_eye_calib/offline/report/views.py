@@ -1,4 +1,4 @@
-"""Draw the sensors of a result in space, from three sides, with the uncertainty of their positions.
+"""Draw the sensors of a result from three sides, with the uncertainty of their positions.
 
 :func:`plot` is the public function; the report has the same three views as a figure.
 """
@@ -37,8 +37,8 @@ from hand_eye_calib.offline.report.style import (
 # Longest name of a sensor that fits into a view, in characters.
 _MAX_NAME = 14
 
-# The three views and their titles. The key has the parent's axes that are drawn to the right and
-# upwards. The title has the axis that points at the reader or away.
+# The three views, with their titles. The key has the parent's axes to the right and upwards. The
+# title has the axis along which the reader looks.
 VIEWS = {"xy": "along z", "xz": "along y", "yz": "along x"}
 # Titles for a vehicle, with x forward and z up.
 VIEWS_OF_VEHICLE = {
@@ -78,7 +78,7 @@ def plot(calibration: Calibration, ax: Any = None) -> Figure:
     Raises
     ------
     InputError
-        If ``calibration`` is no Calibration, or ``ax`` has not three axes.
+        If ``calibration`` is not a Calibration, or ``ax`` does not have three axes.
 
     Examples
     --------
@@ -123,7 +123,7 @@ def draw_views(
     *calibrations: Calibration,
     titles: Mapping[str, str] = VIEWS,
 ) -> None:
-    """Draw the parent sensor and all child sensors in its frame, one view in each of three panels.
+    """Draw the parent sensor and all child sensors in its frame, with one view per panel.
 
     Several calibrations have the same parent sensor. ``titles`` has the keys of :data:`VIEWS`.
     """
@@ -162,7 +162,7 @@ def draw_views(
 
 
 def _short_name(frame: str, role: str) -> str:
-    """Return the name of a sensor in a view: its frame, its role if that is too long for the view.
+    """Return the name of a sensor in a view: its frame or, if this is too long, its role.
 
     Without a role, the middle of a long name is left out.
     """
@@ -214,8 +214,8 @@ def _draw_sensor(
 ) -> None:
     """Draw a sensor's axes and its name.
 
-    ``T`` (2, 4) are the rows of its pose for the two axes of the view, ``axis_m`` is the length of
-    its axes, and ``below`` the vertical offset of the name (points).
+    ``T`` (2, 4) has the rows of the pose for the two axes of the view. ``axis_m`` is the length of
+    the sensor's axes, and ``below`` the vertical offset of the name (points).
     """
     origin = T[:, 3]
     for axis, axis_colour in zip(T[:, :3].T, (BAD, GREEN, PARENT), strict=True):
