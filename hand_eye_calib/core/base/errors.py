@@ -79,7 +79,7 @@ class MissingDependencyError(HandEyeCalibError, ImportError):
 def require_type(
     name: str, value: object, *kinds: type, remedy: str = ""
 ) -> None:
-    """Raise InputError if an argument of the Python interface is of none of these types."""
+    """Raise InputError if an argument of the Python interface has none of these types."""
     if not isinstance(value, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
         text = f"{name} must be of type {expected}; got {type(value).__name__}"

@@ -28,7 +28,7 @@ STREAM_REPAIRS = (
 # this. The misfit is 1 for the right model, and smaller without noise.
 _MAX_MISFIT = 2.0
 
-# Growth of a sigma by open faults above which a result is examined again.
+# A result is examined again if open faults increase a sigma by more than this factor.
 _MUCH_WIDER = 1.05
 
 
@@ -183,7 +183,7 @@ def with_options(snapshot: Snapshot, options: Options) -> Snapshot:
 def check(
     snapshot: Snapshot, calibration: Calibration | None = None
 ) -> CheckResult:
-    """Check the streams of a snapshot, with their result if there is one."""
+    """Check the streams of a snapshot, together with their result if there is one."""
     return kind_of(snapshot.config).check(snapshot, calibration)
 
 
@@ -192,9 +192,9 @@ def with_open_errors(
     result: CheckResult,
     snapshot: Snapshot | None = None,
 ) -> Calibration:
-    """Return the calibration whose allowance contains the faults that a check leaves open.
+    """Return the calibration with an allowance that contains the open faults of a check.
 
-    If sigmas grow much, the calibration is examined again with its snapshot.
+    If sigmas grow much, the calibration is examined again.
     """
     allowance = calibration.covariance_allowance + result.open_covariance
     wider = replace(calibration, covariance_allowance=allowance)
@@ -211,7 +211,7 @@ def checked(calibration: Calibration, snapshot: Snapshot) -> Attempt:
 
 
 def solved_with(snapshot: Snapshot, options: Options) -> Attempt | None:
-    """Solve and check with some options changed; return None if the solve fails."""
+    """Solve and check with some options changed. Return None if the solve fails."""
     try:
         other = with_options(snapshot, options)
         return checked(other.estimate(), other)

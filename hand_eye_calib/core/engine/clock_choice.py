@@ -21,16 +21,16 @@ from hand_eye_calib.core.engine.snapshot import (
 
 ESTIMATED_CLOCK: Options = {"time_offset": "estimate"}
 
-# The time offset of the check, with its clock rate, is used if its spread (see TimeOffset) is below
-# this share of the largest offset in the recording.
+# The time offset of the check, with its clock rate, is used if its spread (TimeOffset.spread_s) is
+# below this share of the largest offset in the recording.
 _CLEAR_SPREAD = 0.5
 
 
 def on_another_clock(snapshot: Snapshot) -> Attempt | None:
     """Return the attempt with an estimated time offset if the clocks clearly differ, else None.
 
-    If this attempt is good, the solve without time offset is saved. It is not made if the options
-    or the kind of data exclude a time offset, or if other mistakes must be repaired first.
+    If this attempt is good, no solve without a time offset is needed. The attempt is not made if
+    options or kind of data exclude a time offset, or if other mistakes must be repaired first.
     """
     config = snapshot.config
     is_free = (
@@ -52,9 +52,9 @@ def on_another_clock(snapshot: Snapshot) -> Attempt | None:
     smallest_s = abs(preliminary.seconds) - 3.0 * preliminary.sigma_s
     if fit is None or smallest_s < MOST_MOVED_S:
         return None
-    # If conventions or units are wrong, the streams are first solved without a repair: the message
-    # of the repair contains the verdict of this solve.
-    # A smaller difference of lengths is no wrong unit: the noise model estimates it as a scale.
+    # With wrong conventions or units, the streams are first solved without a repair, because the
+    # message of the repair contains the verdict of this solve. A small difference of lengths is not
+    # a wrong unit: the noise model estimates it as a scale.
     scale_error = abs(math.log(fit.scale))
     is_other_unit = fit.has_own_unit and scale_error >= LIMITS["scale"].error
     if is_other_unit or fit.unexplained > HOLDS:
@@ -69,7 +69,7 @@ def on_another_clock(snapshot: Snapshot) -> Attempt | None:
 
 
 def clock_is_off(first: Attempt) -> bool:
-    """Return whether the time offset has changed so much that poses must be paired anew."""
+    """Return whether poses must be paired anew, because the time offset has changed too much."""
     snapshot = first.snapshot
     calibration = first.calibration
     moved_s = abs(
@@ -78,7 +78,7 @@ def clock_is_off(first: Attempt) -> bool:
     clock = first.check.offset
     is_free = not METHODS[snapshot.config.method].uses_reference
     if clock and is_free and snapshot.config.reference == "auto":
-        # Only the check estimates a clock rate; for DNLO, only the check estimates the offset.
+        # Only the check estimates a clock rate. For DNLO, only the check estimates the offset.
         largest_s = clock.largest_s(snapshot.unpaired[1].duration_s)
         if clock.spread_s < _CLEAR_SPREAD * largest_s:
             moved_s = max(moved_s, largest_s - _CLEAR_SPREAD * clock.spread_s)

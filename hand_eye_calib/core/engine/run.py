@@ -64,7 +64,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 # progress.
 _CHECKS_BEGIN = 0.8
 
-# Reasons to estimate an option, without the estimate.
+# Reasons for estimating an option, without the value of the estimate.
 _REASONS_TO_ESTIMATE = {
     "time_offset": "the clocks may differ",
     "scale": "the lengths may differ",
@@ -162,7 +162,7 @@ def review(
 def _solved_and_checked(
     snapshot: Snapshot, checks: bool | None, report: Progress
 ) -> Attempt:
-    """Return the best attempt at a snapshot; ``checks`` is that of :func:`run`."""
+    """Return the best attempt at a snapshot. For ``checks`` see :func:`run`."""
     on_clock = on_another_clock(snapshot)
     if on_clock and on_clock.is_sound and not on_clock.check.readings:
         return _with_estimate_warnings(on_clock, ESTIMATED_CLOCK, ())

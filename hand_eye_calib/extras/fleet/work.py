@@ -62,7 +62,7 @@ class Task:
     sources : dict
         Topics or WORLD:SENSOR of "parent" and "child", if the user set them.
     without : tuple of str
-        Names of the measurements in addition to motion that are switched off.
+        Names of the measurements without motion that are switched off.
     with_fingerprints, with_report : bool
         Whether to compute hashes of the input files, and to render a report.
     """

@@ -327,7 +327,7 @@ def turning_axis(trajectory: Trajectory) -> FloatArray:
     turns = se3.rotations_between(rotations[:-1], rotations[1:])
     products = turns.T @ turns
     squares, axes = np.linalg.eigh(products)
-    # The eigenvalues are ascending.
+    # The last axis has the largest eigenvalue.
     largest_other = _MAX_OTHER_SHARE**2 * squares[2]
     if squares[1] >= largest_other:
         raise NotEnoughDataError(

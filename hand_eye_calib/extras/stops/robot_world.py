@@ -364,7 +364,7 @@ def _fit(
     degrees : float
         Degrees of freedom of the Student-t distribution.
     rests : (N,) array
-        Weights of stops at one place.
+        Weights of the stops, smaller for several stops at one place.
     """
     X, Z = start
     n = len(stops)
@@ -454,7 +454,7 @@ def _with_lasting_errors(
     whitening : (N, 6, 6) array
         Matrices that make the errors of each stop independent, with unit variance.
     rests : (N,) array
-        Weights of stops at one place.
+        Weights of the stops, smaller for several stops at one place.
     views : (N, 13) array
         Views of the stops, from :func:`views_of_stops`.
     stretch : float

@@ -147,7 +147,7 @@ def choose(
     ]
     groups: list[Sequence[TopicInfo | _Candidate]] = [poses, moving]
     groups += [moving + paths, moving + others, sensors, of_known_kinds]
-    # The choice is obvious if the number of topics in a group fits, or the number of sensors.
+    # The choice is obvious if a group has the right number of topics, or of sensors.
     for group in groups:
         if len(group) == n_missing:
             return [item.name for item in group]

@@ -67,7 +67,7 @@ def _columns_of_matrices(
 ) -> tuple[Sequence[str], FloatArray, list[str]]:
     """Return the columns of matrices (N, 3, 4) or (N, 4, 4), as :func:`columns_of_array` does.
 
-    Transposed matrices, whose last column is 0 0 0 1, are transposed back, with a note.
+    Matrices whose last column is 0 0 0 1 are transposed, with a note.
     """
     notes = []
     if matrices.shape[1:] == (4, 4) and not _has_last_row(matrices):
@@ -81,9 +81,9 @@ def _columns_of_matrices(
 
 
 def _has_last_row(matrices: FloatArray) -> bool:
-    """Whether the last row of all matrices (N, 4, 4) with a pose is 0 0 0 1.
+    """Return whether the last row of all matrices (N, 4, 4) with a pose is 0 0 0 1.
 
-    Matrices that are not finite or all 0 contain no pose and are ignored.
+    Matrices that are not finite or all 0 contain no pose, and are ignored.
     """
     is_finite = np.isfinite(matrices).all(axis=(1, 2))
     is_zero = ~matrices.any(axis=(1, 2))
@@ -101,8 +101,8 @@ def table_of_object(source: Any, times: Any = None) -> Table:
     Raises
     ------
     InputError
-        If the source is neither an array nor a DataFrame, or if there is not one stamp, a number or
-        datetime, for each pose.
+        If the source is neither an array nor a DataFrame, or if a pose has no stamp that is a
+        number or a datetime.
     """
     if hasattr(source, "columns"):
         keys = [*source.columns]
@@ -133,7 +133,7 @@ def table_of_object(source: Any, times: Any = None) -> Table:
 
 
 def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
-    """Return the stamps from the columns of a DataFrame that contain them; None without columns."""
+    """Return the stamps from the columns of a DataFrame, or None without such columns."""
     if len(columns) < 2:
         return columns[0] if columns else None
     rows = zip(*(map(str, column) for column in columns), strict=True)
@@ -145,13 +145,13 @@ def _times_of_columns(columns: Sequence[Any], table: Table) -> Any:
 def _stamps_of_objects(
     times: Any, table: Table, n_poses: int
 ) -> list[Decimal | None]:
-    """Return the stamp of each pose, from numbers or datetimes; None for a missing time.
+    """Return the stamp of each pose from numbers or datetimes. A missing time is None.
 
     For datetimes, this also sets the unit of the table's stamps to ns.
     """
     if isinstance(times, list) and times and isinstance(times[0], Decimal):
         return [*times]
-    # Pandas has datetimes with a time zone, which numpy does not: convert them to UTC.
+    # Pandas has datetimes with a time zone, and numpy has not. Convert them to UTC.
     if getattr(getattr(times, "dtype", None), "tz", None) is not None:
         times = np.asarray(times, dtype="datetime64[ns]")
     stamps = np.asarray(times)

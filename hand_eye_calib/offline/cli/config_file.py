@@ -18,7 +18,7 @@ from hand_eye_calib.offline.cli.options import (
     note,
 )
 
-# Options of a parameter file that only the node uses, and those that rclpy declares.
+# Options in a parameter file that only the node uses, and options that rclpy declares.
 _NODE_OPTIONS = config.NodeConfig.by_name()
 
 _ROS_OPTIONS = (
@@ -27,7 +27,7 @@ _ROS_OPTIONS = (
     "qos_overrides",
 )
 
-# Names of nodes in a parameter file whose section applies to the calibrator.
+# Names of nodes in a parameter file whose section is for the calibrator.
 _NODES = ("calibrator", "**", "*", "")
 
 # Key of the parameters of a node in a parameter file.
@@ -37,7 +37,7 @@ _ROS_SECTION = "ros__parameters"
 def options_from(arguments: argparse.Namespace) -> Options:
     """Return the options that the user has set, by their public names.
 
-    Options of the command line override those of the file of ``--config``.
+    Options on the command line override options in the file of ``--config``.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def options_from(arguments: argparse.Namespace) -> Options:
 
 
 def _is_of_node(option: str) -> bool:
-    """Whether only the node has this option, or every node of ROS."""
+    """Return whether an option belongs to the node only, or to all nodes of ROS."""
     group, _, _ = option.partition(".")
     return option in _NODE_OPTIONS or group in _ROS_OPTIONS
 
@@ -73,8 +73,7 @@ def _read_config(path: Path) -> Options:
         elif _is_of_node(option):
             ignored.append(repr(option))
         elif value is not None or not option.endswith(_ROS_SECTION):
-            # An empty section ros__parameters appears here as a name without value. It is not an
-            # option.
+            # An empty section ros__parameters looks like a name without value. It is not an option.
             raise _unknown_option(path, option)
     if settings.other_nodes and not (options or ignored):
         nodes = ", ".join(settings.other_nodes)
@@ -88,7 +87,7 @@ def _read_config(path: Path) -> Options:
 
 
 class _Settings(NamedTuple):
-    """Names and values that concern the calibrator in a file, and the names of other nodes."""
+    """Names and values for the calibrator in a file, and the names of other nodes."""
 
     values: list[tuple[str, Any]]
     other_nodes: list[str]
@@ -97,7 +96,7 @@ class _Settings(NamedTuple):
 def _settings_of_file(document: Mapping[str, Any]) -> _Settings:
     """Return the settings of a file; names are without the sections of a ROS parameter file."""
     values = []
-    # The keys of this mapping are a set that keeps the order.
+    # The keys of this mapping are an ordered set.
     other_nodes: dict[str, None] = {}
     for name, value in _flat(document):
         node, is_ros_parameter, option = name.rpartition(f"{_ROS_SECTION}.")
@@ -114,18 +113,18 @@ def _settings_of_file(document: Mapping[str, Any]) -> _Settings:
 def _option_in_file(
     path: Path, option: str, value: object
 ) -> tuple[str, OptionValue]:
-    """Return the name and the checked value of an option; an error names the file."""
+    """Return the name and the checked value of an option. An error names the file."""
     try:
         return checked_option(option, value)
     except ConfigError as error:
-        # as_typed() does not change a name in quotes: it keeps the spelling of the file.
+        # Quotes protect the name from as_typed(), so that it keeps the spelling of the file.
         text = str(error).replace(option, repr(option), 1)
         raise ConfigError(f"{path}: {text}") from None
 
 
 def _unknown_option(path: Path, option: str) -> ConfigError:
     """Return the error about an unknown option in a file of options."""
-    # as_typed() does not change names in quotes: they keep the spelling of the file.
+    # Quotes protect the names from as_typed(), so that they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
     hint = (
         did_you_mean(repr(option), names) or f"; known are {', '.join(names)}"
@@ -136,7 +135,7 @@ def _unknown_option(path: Path, option: str) -> ConfigError:
 def _flat(
     mapping: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, Any]]:
-    """Yield names and values of nested mappings; the keys of a name are joined by dots."""
+    """Yield names and values of nested mappings. A name has the joined keys, with dots between."""
     for name, value in mapping.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{name}.")

@@ -268,7 +268,7 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     _name_plane(plane, first, second)
     side.set(title="Height" if across == 2 else "Across the plane of motion")
     side.set(xlabel=f"time ({unit})", ylabel=_AXIS_LABELS[across])
-    # Show at least half a metre: on a flat road, rounding would look like hills.
+    # Show at least half a metre. Otherwise rounding would look like hills on a flat road.
     low, high = side.get_ylim()
     if high - low < 0.5:
         side.set_ylim((low + high) / 2 - 0.25, (low + high) / 2 + 0.25)

@@ -63,7 +63,7 @@ class Broadcast(Enum):
 # Level of a condition of the node, and a line of text about the condition.
 Condition: TypeAlias = tuple[Level, str]
 
-# Whether the result is broadcast, and the reason if it is not.
+# Whether the result is broadcast; if not, the reason.
 BroadcastState: TypeAlias = tuple[Broadcast, str]
 
 # Success of a request and a line of text about it.
