@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.extras.partial import positions
+from hand_eye_calib.extras.partial.position_tuning import (
+    TUNING,
+    PositionTuning,
+)
 from reproduction.ablation import Case, outcome, real_cases, simulated_cases
 from reproduction.writing import seed_of, study_parser, write_csv
 
@@ -30,7 +33,7 @@ def chosen(folder: Path | None, seed: int) -> list[Case]:
     return [*first.values()]
 
 
-def changed(name: str, factor: float) -> Tuning:
+def changed(name: str, factor: float) -> PositionTuning:
     """Multiply a constant by a factor; logarithms of variances are shifted instead."""
     value = getattr(TUNING, name)
     is_log = bool(np.min(value) < 0)
@@ -48,7 +51,9 @@ def changed(name: str, factor: float) -> Tuning:
     return dataclasses.replace(TUNING, **{name: new_value})
 
 
-def measured(cases: Sequence[Case], tuning: Tuning = TUNING) -> FloatArray:
+def measured(
+    cases: Sequence[Case], tuning: PositionTuning = TUNING
+) -> FloatArray:
     """Errors of translation and rotation, and squared errors over their variances (N, 3)."""
     rows = []
     for case in cases:

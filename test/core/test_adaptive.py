@@ -484,7 +484,7 @@ def test_a_long_recording_is_solved_in_parts(monkeypatch):
     parent, child = fixed_to_body(*noisy_drive(6, 900), errors)
     child[300:, :3, 3] += [0.5, -0.3, 0.2]
     whole = estimator.solve(stamps(900), parent, child)
-    monkeypatch.setattr(partwise, "MAX_POSES", 200)
+    monkeypatch.setattr(partwise, "PART_POSES", 200)
     monkeypatch.setattr(fit, "MAX_POSES", 200)
 
     in_parts = estimator.solve(stamps(900), parent, child)

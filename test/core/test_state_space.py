@@ -356,7 +356,7 @@ def test_chi_squares_of_jitter_along_one_velocity_are_finite():
 def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(
     monkeypatch,
 ):
-    monkeypatch.setattr(partwise, "MAX_POSES", 5)
+    monkeypatch.setattr(partwise, "PART_POSES", 5)
     whole = replace(
         space_of(cut=(4, 9)), group_sizes=(), prior=np.eye(N_PARAMETERS + 1)
     )

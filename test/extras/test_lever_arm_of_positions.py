@@ -14,9 +14,9 @@ from hand_eye_calib.core.engine.attempts import check
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.results.document import usable_numbers
 from hand_eye_calib.extras.partial import positions
+from hand_eye_calib.extras.partial.position_tuning import TUNING
 from hand_eye_calib.offline.cli.main import main
 from reproduction.partial import simulated_positions
 

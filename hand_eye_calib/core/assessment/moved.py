@@ -65,6 +65,8 @@ _VEHICLE_SIGMA_RATIO = 4.0
 _BLOCK_NS = 1_000_000_000
 # Largest number of motion pairs per block, on average over the recording.
 _MAX_PAIRS_PER_BLOCK = 20
+# Number of motion pairs whose H and S are computed at once. It limits the memory.
+_BATCH = 10_000
 
 # Number of iterations in the estimate of the noise covariance.
 _NOISE_ITERATIONS = 4
@@ -394,16 +396,30 @@ def evidence_by_second(
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
     max_pairs = max(duration_ns * _MAX_PAIRS_PER_BLOCK // _BLOCK_NS, 2)
     pairs = pairs_over(pose_pairs, lag_s, max_pairs)
-    residuals, jacobians = residuals_and_jacobians(pairs, T_parent_child)
+    starts = range(0, max(len(pairs), 1), _BATCH)
+    batches = [slice(start, start + _BATCH) for start in starts]
+    linearised = [
+        residuals_and_jacobians(pairs[batch], T_parent_child)
+        for batch in batches
+    ]
+    residuals = np.concatenate([residuals for residuals, _ in linearised])
     covariance, weights = noise_covariance(residuals)
-    if further_columns:
-        jacobians = np.concatenate([jacobians, further_columns(pairs)], axis=2)
-    tables = evidence(residuals, jacobians, covariance, weights)
     middles_ns = (stamps_ns[pairs.i] + stamps_ns[pairs.j]) // 2
     block_of_pair = (middles_ns - stamps_ns[0]) // _BLOCK_NS
     n_blocks = duration_ns // _BLOCK_NS + 1
+    sums = []
+    for batch, (_, jacobians) in zip(batches, linearised, strict=True):
+        if further_columns:
+            jacobians = np.concatenate(
+                [jacobians, further_columns(pairs[batch])], axis=2
+            )
+        tables = evidence(
+            residuals[batch], jacobians, covariance, weights[batch]
+        )
+        blocks = Blocks.gathered(tables, block_of_pair[batch], n_blocks)
+        sums.append(blocks.sums)
     starts_ns = stamps_ns[0] + np.arange(n_blocks) * _BLOCK_NS
-    return starts_ns, Blocks.gathered(tables, block_of_pair, n_blocks)
+    return starts_ns, Blocks(np.sum(sums, axis=0))
 
 
 def possible_shift(

@@ -249,7 +249,7 @@ def linearise(
     # Smoothed steps in the child's frame, and the derivatives with respect to a bias per metre.
     steps = se3.times(R_c_transposed, np.diff(course.path, axis=0))
     metres = R_c_transposed @ np.diff(course.along, axis=0)
-    B, by_rate = _child_motions(streams, course, parameters)
+    B = _child_motions(streams, course, parameters)
     scaled = (1.0 + parameters[SCALE]) * se3.translation_of(B)
     B[:, :3, 3] = scaled - metres @ parameters[BIAS]
     B_inverse = se3.inverse(B)
@@ -269,11 +269,14 @@ def linearise(
     systematic[:, :, TIME] = (
         se3.times(adjoints, course.twists[:-1]) - course.twists[1:]
     )
-    systematic[:, 3:, RATE] = by_rate
-    by_xi = np.eye(6) - adjoints
-    all_columns = np.concatenate(
-        [by_xi, systematic[:, :, columns], residuals[:, :, None]], axis=2
-    )
+    if not set(columns).isdisjoint(RATE):
+        systematic[:, 3:, RATE] = _derivatives_by_rate_bias(
+            transposed(R_B_transposed), np.diff(streams.stamps_s)
+        )
+    all_columns = np.empty((len(steps), 6, 7 + len(columns)))
+    all_columns[:, :, :6] = np.eye(6) - adjoints
+    all_columns[:, :, 6:-1] = systematic[:, :, columns]
+    all_columns[:, :, -1] = residuals
     by_path = {"scale": by_steps[:, :, :1], "direction": by_steps[:, :, 1:]}
     return Linearisation(all_columns, adjoints, by_path)
 
@@ -295,27 +298,22 @@ def first_residuals(
 
 def _child_motions(
     streams: Streams, course: Course, parameters: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Compute motions of the child, corrected for its time offset and its bias of angular rates.
-
-    Returns
-    -------
-    (n, 4, 4) array
-        Corrected motions.
-    (n, 3, 3) array
-        Derivatives (s) of the measured rotations with respect to the bias of rates.
-    """
-    Ts_cw_c = streams.Ts_cw_c
+) -> FloatArray:
+    """Return motions (n, 4, 4) of the child, corrected for its time offset and bias of rates."""
     if parameters[TIME]:
-        Ts_cw_c = Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
-    child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
-    rotations = se3.rotation_of(child_motions)
-    by_rate = _derivatives_by_rate_bias(rotations, np.diff(streams.stamps_s))
+        Ts_cw_c = streams.Ts_cw_c @ se3.exp(parameters[TIME] * course.twists)
+        child_motions = motions(Ts_cw_c[:-1], Ts_cw_c[1:])
+    else:
+        child_motions = streams.motions_c.copy()
     if parameters[RATE].any():
+        rotations = se3.rotation_of(child_motions)
+        by_rate = _derivatives_by_rate_bias(
+            rotations, np.diff(streams.stamps_s)
+        )
         child_motions[:, :3, :3] = rotations @ se3.rotation_exp(
             -by_rate @ parameters[RATE]
         )
-    return child_motions, by_rate
+    return child_motions
 
 
 def _derivatives_by_rate_bias(

@@ -23,9 +23,11 @@ from hand_eye_calib.core.noise.state_space import (
     combined,
 )
 
-# Largest number of poses of a part. The posterior of such a part needs about 90 MB. For a simulated
-# drive of 100,000 poses, parts of 20,000 increase the sigmas by 0.05 %.
+# Largest number of poses of a recording that is not divided.
 MAX_POSES = 10_000
+# Largest number of poses of a part. The posterior of such a part needs about 45 MB. For a simulated
+# drive of 100,000 poses, parts of 20,000 increase the sigmas by 0.05 %.
+PART_POSES = 5_000
 
 
 class PartwisePosterior:
@@ -50,7 +52,7 @@ class PartwisePosterior:
         prior: FloatArray,
         levels: FloatArray,
     ) -> None:
-        n_parts = -(-n_poses // MAX_POSES)
+        n_parts = -(-n_poses // PART_POSES)
         self._poses_of_parts = np.array_split(np.arange(n_poses), n_parts)
         self._space_of = space_of
         self._prior = prior

@@ -8,11 +8,10 @@ negative log likelihood (Patterson, Thompson, Biometrika 58, 1971):
     P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1
     d loss / d theta_k = 1/2 (tr(P V_k) - e' P V_k P e),      V_k = dV / d theta_k
 
-The information ``J' V^-1 J`` contains the prior of beta. The gradient is exact, except for the
-processes: the derivative of their prior is numerical. The gradient needs only the blocks of the
-states' covariance on the diagonal and next to it. The curvature is the average information, the
-mean of observed and expected information (Gilmour, Thompson, Cullis, Biometrics 51, 1995): ``1/2
-f_k' P f_l`` with ``f_k = V_k P e``.
+The information ``J' V^-1 J`` contains the prior of beta. The gradient is exact. It needs only the
+blocks of the states' covariance on the diagonal and next to it. The curvature is the average
+information, the mean of observed and expected information (Gilmour, Thompson, Cullis, Biometrics
+51, 1995): ``1/2 f_k' P f_l`` with ``f_k = V_k P e``.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.noise.normal import multiplied, transposed
 from hand_eye_calib.core.noise.state_space import (
-    LEVEL_CHANGE,
     WHITE,
     Markov,
     Posterior,
@@ -211,31 +209,27 @@ def _walk_difference(posterior: Posterior, walk: FloatArray) -> FloatArray:
 def _group_gradient(
     posterior: Posterior, group: Markov, states: FloatArray
 ) -> FloatArray:
-    """Return numerical derivatives (2,) of the loss with respect to the two levels of a group.
+    """Return the derivatives (2,) of the loss with respect to the two levels of a group.
 
     The levels are the log variance and the log time constant. The loss depends on them through
-    ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is the prior
-    precision of a process, and E[g g'] are its posterior second moments, which are constant here.
+    ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is their prior
+    precision, E[g g'] are their posterior second moments.
     """
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
-    n_processes = values.shape[1]
-    # Second moments, summed over the processes of the group: at each pose (N,), and between each
-    # pose and the previous pose (n,).
+    n_poses, n_processes, _ = values.shape
+    # Second moments at each pose (N,), and between each pose and the pose before (n,), summed
+    # over the processes of the group.
     squares = np.einsum("nii->n", covariance[:, group.states, group.states])
     squares += np.einsum("nij,nij->n", values, values)
     products = np.einsum("nii->n", below[:, group.states, group.states])
     products += np.einsum("nij,nij->n", values[1:], values[:-1])
-    gradient = np.zeros(2)
-    for sign in (1.0, -1.0):
-        for level, change in enumerate(sign * LEVEL_CHANGE * np.eye(2)):
-            changed = group.changed(change)
-            trace = float(
-                changed.diagonal @ squares + 2.0 * changed.between @ products
-            )
-            deviance = trace + n_processes * changed.log_determinant
-            gradient[level] += sign * deviance / (4.0 * LEVEL_CHANGE)
-    return gradient
+    trace = group.diagonal @ squares + 2.0 * group.between @ products
+    by_log_variance = n_processes * n_poses - trace
+    diagonal, between, log_determinant = group.by_log_tau()
+    by_log_tau = diagonal @ squares + 2.0 * between @ products
+    by_log_tau += n_processes * log_determinant
+    return np.array([0.5 * by_log_variance, 0.5 * by_log_tau])
 
 
 def _average_information(
@@ -284,7 +278,7 @@ def _working_columns(
     ):
         values = states[:, group.states]
         moved[:, group.states, level] = values
-        moved[:, group.states, level + 1] = group.derivative_by_log_tau(values)
+        moved[:, group.states, level + 1] = group.covariance_by_log_tau(values)
     f = space.apply_u(moved)
     # Levels of the walk: f_k = (d W^-1 / d theta_k) W w.
     forces = walk @ posterior.walk_precision

@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -47,10 +48,6 @@ WHITE = 6
 
 # Relative increase of the diagonal of Lambda. Rounding could otherwise make Lambda indefinite.
 _DIAGONAL_INCREASE = 1e-13
-
-# Change of a level in numerical derivatives. The errors of truncation and of rounding are then both
-# about 1e-10.
-LEVEL_CHANGE = 1e-5
 
 # Largest number of blocks of time for the jackknife.
 MAX_BLOCKS = 20
@@ -173,45 +170,68 @@ class Markov:
         self, states: slice, levels: FloatArray, intervals_s: FloatArray
     ) -> None:
         self.states = states
-        self._levels = levels
-        self._intervals_s = intervals_s
-        ratios = intervals_s / np.exp(levels[1])
-        phi = np.exp(-ratios)
-        variances_of_q = -np.exp(levels[0]) * np.expm1(-2.0 * ratios)
-        self.first = float(np.exp(-levels[0]))
-        self.after = 1.0 / variances_of_q
-        self.between = -phi * self.after
-        self.before = phi**2 * self.after
+        self._ratios = intervals_s / np.exp(levels[1])
+        self._phi = np.exp(-self._ratios)
+        stationary = np.exp(levels[0])
+        # Variances of the first value, and of each step q, relative to the stationary variance.
+        self._q_shares = -np.expm1(-2.0 * self._ratios)
+        self._variances = np.append(stationary, stationary * self._q_shares)
+        self.first = float(1.0 / stationary)
+        self.after = 1.0 / self._variances[1:]
+        self.between = -self._phi * self.after
+        self.before = self._phi**2 * self.after
         self.diagonal = np.append(self.first, self.after) + np.append(
             self.before, 0.0
         )
-        self.log_determinant = float(levels[0] + np.log(variances_of_q).sum())
+        self.log_determinant = float(np.log(self._variances).sum())
 
-    def changed(self, change: FloatArray) -> Markov:
-        """Return the same group, with its levels changed by ``change`` (2,)."""
-        return Markov(self.states, self._levels + change, self._intervals_s)
+    def by_log_tau(self) -> tuple[FloatArray, FloatArray, float]:
+        """Return derivatives with respect to the logarithm of the time constant.
 
-    def forces(self, values: FloatArray) -> FloatArray:
-        """Return ``Pi values`` (N, k) for the values (N, k) of k processes."""
-        forces = self.diagonal[:, None] * values
-        forces[1:] += self.between[:, None] * values[:-1]
-        forces[:-1] += self.between[:, None] * values[1:]
-        return forces
+        Returns
+        -------
+        (N,) array
+            Derivative of ``diagonal``.
+        (n,) array
+            Derivative of ``between``.
+        float
+            Derivative of ``log_determinant``.
+        """
+        ratios = self._ratios
+        # Derivative of the logarithm of the precision of q.
+        relative = 2.0 * ratios * self._phi**2 / self._q_shares
+        diagonal = np.append(0.0, relative * self.after)
+        diagonal[:-1] += (2.0 * ratios + relative) * self.before
+        between = (ratios + relative) * self.between
+        return diagonal, between, -float(relative.sum())
 
-    def derivative_by_log_tau(self, values: FloatArray) -> FloatArray:
+    def covariance_by_log_tau(self, values: FloatArray) -> FloatArray:
         """Return ``(d Pi^-1 / d log tau) Pi values`` (N, k) for the values (N, k) of k processes.
 
-        The result equals ``-Pi^-1 (d Pi / d log tau) values``. The derivative of Pi is numerical.
+        It equals ``-Pi^-1 (d Pi / d log tau) values``. Pi is ``L' Q^-1 L`` with the variances Q and
+        ``(L g)_{i+1} = g_{i+1} - phi_i g_i``.
         """
-        change = np.array([0.0, LEVEL_CHANGE])
-        forces = self.changed(change).forces(values) - self.changed(
-            -change
-        ).forces(values)
-        factor = Factor(
-            self.diagonal[:, None, None], self.between[:, None, None]
-        )
-        moved = factor.restore(factor.whiten(forces[:, None]))[:, 0]
-        return moved / (-2.0 * LEVEL_CHANGE)
+        diagonal, between, _ = self.by_log_tau()
+        forces = diagonal[:, None] * values
+        forces[1:] += between[:, None] * values[:-1]
+        forces[:-1] += between[:, None] * values[1:]
+        backward = decaying_sum(forces[::-1], self._phi[::-1])[::-1]
+        return decaying_sum(-self._variances[:, None] * backward, self._phi)
+
+
+def decaying_sum(values: FloatArray, phi: FloatArray) -> FloatArray:
+    """Return x (N, k) with ``x_{i+1} = values_{i+1} + phi_i x_i`` and ``x_0 = values_0``.
+
+    The sum over a window doubles its length in each round, so that numpy needs few operations.
+    """
+    sums = values.copy()
+    factors = np.append(0.0, phi)[:, None]
+    length = 1
+    while length < len(sums):
+        sums[length:] += factors[length:] * sums[:-length]
+        factors[length:] *= factors[:-length]
+        length *= 2
+    return sums
 
 
 class Posterior:
@@ -234,21 +254,6 @@ class Posterior:
         The precision W of increment i is ``walk_weights[i] walk_precision``; zero for increments
         without information.
     groups : list of Markov
-    factor : Factor
-        Cholesky factor L of Lambda. Its ``selected_inverse`` contains the covariances of the states
-        for known parameters: at each pose (N, d, d), and between each pose and the previous pose
-        (n, d, d).
-    log_determinant : float
-        log|V|, with V restricted to the increments that have information.
-    whitened : (N, d, p + 1) array
-        Y for Z = [J e].
-    products : (p + 1, p + 1) array
-        ``[J e]' V^-1 [J e]``, plus the prior of the parameters.
-    normal : NormalEquations
-        Generalised least squares solution for the parameters beta.
-    loss : float
-        Negative restricted log likelihood without constants (Patterson, Thompson, Biometrika 58,
-        1971).
 
     Raises
     ------
@@ -261,8 +266,8 @@ class Posterior:
         self.levels = levels
         n_white = len(space.white_bases)
         is_free = space.weights == 0.0
-        self.white_precision, white_log_determinants = space.white_precision(
-            levels
+        self.white_precision, self._white_log_determinants = (
+            space.white_precision(levels)
         )
         self._white_precisions = (
             space.weights[:, None, None] * self.white_precision
@@ -278,18 +283,6 @@ class Posterior:
             self.walk_weights[:, None, None] * self.walk_precision
         )
         self.groups = self._groups(n_white + len(space.walk_bases))
-        self.factor = self._factorised()
-        self.log_determinant = self._log_determinant(
-            white_log_determinants[~is_free]
-        )
-        weighted, self.whitened = self.forward_half(space.columns)
-        products = multiplied(space.columns, weighted) - multiplied(
-            self.whitened, self.whitened
-        )
-        self.products = 0.5 * (products + products.T) + space.prior
-        self.normal = NormalEquations(self.products)
-        determinants = self.log_determinant + self.normal.log_determinant
-        self.loss = 0.5 * float(determinants + self.normal.cost)
 
     def _groups(self, first_level: int) -> list[Markov]:
         """Return all groups of processes. ``first_level`` is the index of their first level."""
@@ -309,29 +302,66 @@ class Posterior:
             level += 2
         return groups
 
-    def _factorised(self) -> Factor:
-        """Return the Cholesky factor of Lambda.
-
-        The blocks of Lambda are as large as the factor. They are local variables, so their memory
-        is released.
-        """
+    @cached_property
+    def factor(self) -> Factor:
+        """Cholesky factor L of Lambda."""
+        # The blocks of Lambda are as large as the factor. They are local and so are released.
         diagonal, below = self._precision_blocks(0, len(self.space.cut))
         np.einsum("nii->ni", diagonal)[:] *= 1.0 + _DIAGONAL_INCREASE
         return Factor(diagonal, below)
 
-    def _log_determinant(self, white_log_determinants: FloatArray) -> float:
-        """Return log|V| from the log determinants of Lambda, Pi and W."""
+    @cached_property
+    def log_determinant(self) -> float:
+        """log|V|, from the log determinants of Lambda, Pi and W."""
         space = self.space
-        weights = space.weights[space.weights != 0.0]
-        of_pi = float((WHITE * np.log(weights) - white_log_determinants).sum())
+        is_weighted = space.weights != 0.0
+        weights = space.weights[is_weighted]
+        of_pi = (
+            WHITE * np.log(weights) - self._white_log_determinants[is_weighted]
+        )
+        log_pi = float(of_pi.sum())
         for group, size in zip(self.groups, space.group_sizes, strict=True):
-            of_pi -= size * group.log_determinant
+            log_pi -= size * group.log_determinant
         walk_factors = space.walk_factors[~space.cut]
         of_walk = WHITE * np.log(walk_factors).sum()
         of_walk += (
             len(walk_factors) * np.linalg.slogdet(self.walk_covariance)[1]
         )
-        return float(of_walk + self.factor.log_determinant - of_pi)
+        return float(of_walk + self.factor.log_determinant - log_pi)
+
+    @cached_property
+    def _whitened_and_products(self) -> tuple[FloatArray, FloatArray]:
+        """``whitened`` and ``products``."""
+        columns = self.space.columns
+        weighted, whitened = self.forward_half(columns)
+        products = multiplied(columns, weighted) - multiplied(
+            whitened, whitened
+        )
+        return whitened, 0.5 * (products + products.T) + self.space.prior
+
+    @property
+    def whitened(self) -> FloatArray:
+        """Y (N, d, p + 1) of Z = [J e]."""
+        return self._whitened_and_products[0]
+
+    @property
+    def products(self) -> FloatArray:
+        """``[J e]' V^-1 [J e]`` (p + 1, p + 1), plus the prior of the parameters."""
+        return self._whitened_and_products[1]
+
+    @cached_property
+    def normal(self) -> NormalEquations:
+        """Generalised least squares solution for the parameters beta."""
+        return NormalEquations(self.products)
+
+    @property
+    def loss(self) -> float:
+        """Negative restricted log likelihood without constants.
+
+        Patterson, Thompson, Biometrika 58, 1971.
+        """
+        determinants = self.log_determinant + self.normal.log_determinant
+        return 0.5 * float(determinants + self.normal.cost)
 
     def _precision_blocks(
         self, start: int, end: int

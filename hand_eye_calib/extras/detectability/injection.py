@@ -168,9 +168,10 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
 
 def evidence_of(pose_pairs: PosePairs, X: FloatArray) -> Blocks:
     """Return the evidence by second of a recording on all unknowns, linearised at X (4, 4)."""
+    twists = _twists_of_child(pose_pairs)
 
     def columns_of_streams(pairs: MotionPairs) -> FloatArray:
-        return _columns_of_streams(pairs, pose_pairs)
+        return _columns_of_streams(pairs, twists)
 
     return moved.evidence_by_second(pose_pairs, X, columns_of_streams)[1]
 
@@ -196,10 +197,8 @@ def _by_axis(sizes: FloatArray, is_known: list[bool]) -> dict[str, float]:
     return dict(zip(AXES, stated.tolist(), strict=True))
 
 
-def _columns_of_streams(
-    pairs: MotionPairs, pose_pairs: PosePairs
-) -> FloatArray:
-    """Return the columns (K, 6, 2) of J for errors of the time offset (s) and of the scale."""
+def _twists_of_child(pose_pairs: PosePairs) -> FloatArray:
+    """Return velocities (N, 6), m/s and rad/s, of the child sensor in its own frame."""
     stamps_ns = pose_pairs.stamps_ns
     poses = pose_pairs.Ts_cw_c
     step = max(round(_VELOCITY_STEP_S * 1e9 / median(np.diff(stamps_ns))), 1)
@@ -207,9 +206,15 @@ def _columns_of_streams(
     before = np.maximum(rows - step, 0)
     after = np.minimum(rows + step, len(poses) - 1)
     seconds = (stamps_ns[after] - stamps_ns[before]) * 1e-9
-    twists = (
-        se3.log(se3.inverse(poses[before]) @ poses[after]) / seconds[:, None]
-    )
+    steps = se3.log(se3.inverse(poses[before]) @ poses[after])
+    return np.asarray(steps / seconds[:, None])
+
+
+def _columns_of_streams(pairs: MotionPairs, twists: FloatArray) -> FloatArray:
+    """Return the columns (K, 6, 2) of J for errors of the time offset (s) and of the scale.
+
+    ``twists`` (N, 6) are the velocities of the child at all poses.
+    """
     Bs_inverse = se3.inverse(pairs.Ts_childi_childj)
     of_time_offset = (
         se3.times(se3.adjoint(Bs_inverse), twists[pairs.i]) - twists[pairs.j]

@@ -275,9 +275,7 @@ def _check_path(
     if share < _SUSPECT_PATH:
         if is_scale_given:
             return ()
-        return _check_scale(
-            solution, solution.model.tuning.of_positions[3], paths
-        )
+        return _check_scale(solution, solution.prior_scale_sigma, paths)
     axes = fused.observability[:3]
     is_observed = any(
         dof.verdict is not DofVerdict.UNOBSERVABLE for dof in axes

@@ -26,7 +26,6 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.differences import path_derivatives, stencil
-from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.extras.partial.columns import (
     Column,
     Fit,
@@ -34,6 +33,7 @@ from hand_eye_calib.extras.partial.columns import (
     fit_columns,
     split,
 )
+from hand_eye_calib.extras.partial.position_tuning import TUNING, PositionTuning
 
 # Duration (s) of a window. It is long enough for a turn, and short enough for little drift of an
 # odometry.
@@ -150,7 +150,7 @@ class Smoothing(NamedTuple):
 
 
 def posterior_smoothing(
-    smoothing_s2: float, sigma_s2: float, tuning: Tuning = TUNING
+    smoothing_s2: float, sigma_s2: float, tuning: PositionTuning = TUNING
 ) -> Smoothing:
     """Return the smoothing, given its estimate and the prior.
 
@@ -158,7 +158,7 @@ def posterior_smoothing(
     ----------
     smoothing_s2, sigma_s2 : float
         Estimate and its standard deviation.
-    tuning : Tuning
+    tuning : PositionTuning
         Constants. The last prior of positions is that of the smoothing of usual streams.
     """
     usual_s2 = tuning.of_positions[-1]

@@ -7,7 +7,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.stats import robust_weights
 from hand_eye_calib.core.geometry import se3
-from hand_eye_calib.core.noise.tuning import TUNING, Tuning
+from hand_eye_calib.extras.partial.position_tuning import TUNING, PositionTuning
 
 # Largest number of steps for the starting values.
 _START_STEPS = 50
@@ -82,7 +82,7 @@ def fit_windows(
 
 
 def unexplained_at_start(
-    Ts_pw_p: FloatArray, positions: FloatArray, tuning: Tuning = TUNING
+    Ts_pw_p: FloatArray, positions: FloatArray, tuning: PositionTuning = TUNING
 ) -> float:
     """Return the share of the path that the lever arm of the starting values does not explain.
 

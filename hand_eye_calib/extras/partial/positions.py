@@ -58,8 +58,8 @@ from hand_eye_calib.core.noise.outliers import (
 )
 from hand_eye_calib.core.noise.stages import sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
-from hand_eye_calib.core.noise.tuning import TUNING, Tuning
 from hand_eye_calib.core.results.records import Noise
+from hand_eye_calib.extras.partial.position_tuning import TUNING, PositionTuning
 from hand_eye_calib.extras.partial.position_windows import fit_windows
 
 # Index of a parameter that poses do not have: the response to acceleration (s^2) of the positions
@@ -94,6 +94,7 @@ class LeverArmSolution(ModelSolution):
     covariance: FloatArray
     by_response: FloatArray
     imprecise: BoolArray
+    prior_scale_sigma: float
 
     def describe(self, stamps_ns: IntArray) -> Noise:
         """Return the noise as numbers and as sentences."""
@@ -129,7 +130,7 @@ def solve(
     Ts_pw_p: FloatArray,
     positions: FloatArray,
     with_scale: bool = False,
-    tuning: Tuning = TUNING,
+    tuning: PositionTuning = TUNING,
 ) -> LeverArmSolution:
     """Estimate the lever arm of a sensor that measures positions.
 
@@ -142,7 +143,7 @@ def solve(
         Positions at the same stamps, in their own world.
     with_scale : bool
         Whether to estimate the scale between both worlds.
-    tuning : Tuning
+    tuning : PositionTuning
     """
     lever_arm, scale, rotations = fit_windows(
         Ts_pw_p, positions, with_scale, tuning.window
@@ -192,7 +193,7 @@ class _State:
         Factors of the variance of the walk; above 1 at jumps.
     imprecise : (N,) bool array
         Positions whose neighbourhood is far less precise than the best part of the recording.
-    tuning : Tuning
+    tuning : PositionTuning
     """
 
     positions: FloatArray
@@ -205,7 +206,7 @@ class _State:
     outliers: Outliers
     walk_factors: FloatArray
     imprecise: BoolArray
-    tuning: Tuning
+    tuning: PositionTuning
 
     @classmethod
     def initial(
@@ -213,7 +214,7 @@ class _State:
         streams: increments.Streams,
         lever_arm: FloatArray,
         with_scale: bool,
-        tuning: Tuning,
+        tuning: PositionTuning,
     ) -> _State:
         """Return the state at the start of the search."""
         stamps_s = streams.stamps_s
@@ -358,7 +359,7 @@ class _State:
         ``least_gain``.
         """
         tuning = self.tuning
-        prior = _level_prior(self.model, self.levels)
+        prior = _level_prior(self.model, self.levels, tuning)
         fit, _ = reml.fit(
             self.sampled_space(), self.levels, prior, tuning.settled_loss
         )
@@ -368,7 +369,7 @@ class _State:
             model, levels = self.model.with_processes(
                 ((kind, "translation"),), fit.levels
             )
-            prior = _level_prior(model, levels)
+            prior = _level_prior(model, levels, tuning)
             rival, _ = reml.fit(
                 self.sampled_space(model), levels, prior, tuning.settled_loss
             )
@@ -420,7 +421,7 @@ class _State:
 
 
 def _imprecise(
-    squares: FloatArray, tuning: Tuning, drift_m2: float
+    squares: FloatArray, tuning: PositionTuning, drift_m2: float
 ) -> BoolArray:
     """Detect positions (N,) in a neighbourhood that is far less precise than the best quarter.
 
@@ -428,7 +429,7 @@ def _imprecise(
     ----------
     squares : (N,) array
         Squared errors, m^2.
-    tuning : Tuning
+    tuning : PositionTuning
     drift_m2 : float
         Variance of the odometry's drift between successive positions. It is a lower bound of the
         usual square.
@@ -441,11 +442,13 @@ def _imprecise(
     return sums > tuning.worst_error_factor * usual * counts
 
 
-def _level_prior(model: NoiseModel, levels: FloatArray) -> reml.Prior:
+def _level_prior(
+    model: NoiseModel, levels: FloatArray, tuning: PositionTuning
+) -> reml.Prior:
     """Return the prior of the log levels, for a search that starts at ``levels``."""
     prior = model.prior(levels)
     prior.lower[ROTATION] = prior.upper[ROTATION] = _ANY_ROTATION
-    lowest, _, highest = model.tuning.rotation_walk
+    lowest, _, highest = tuning.rotation_walk
     prior.lower[WALK_ROTATION] = lowest
     prior.upper[WALK_ROTATION] = highest
     return prior
@@ -490,6 +493,7 @@ def _solution(
         model=state.model,
         levels=state.levels,
         imprecise=state.imprecise,
+        prior_scale_sigma=state.tuning.of_positions[3],
         jumps=state.outliers.jumps,
         spikes=state.outliers.spikes,
         part_products=_solved(posterior.part_products()),
@@ -516,7 +520,7 @@ def _by_response(products: FloatArray) -> FloatArray:
 
 
 def _accelerations(
-    streams: increments.Streams, X: FloatArray, tuning: Tuning
+    streams: increments.Streams, X: FloatArray, tuning: PositionTuning
 ) -> FloatArray:
     """Return the accelerations (N, 6) of the antenna by the odometry, m/s^2, in body axes.
 
