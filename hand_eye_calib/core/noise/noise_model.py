@@ -61,9 +61,6 @@ ROTATIONS = np.diag([0, 0, 0, 1.0, 1.0, 1.0])
 
 # Lower bound of all variances (m^2, rad^2, s^2). A smaller variance is rounding.
 MIN_VARIANCE = 1e-14
-# Upper bound of the logarithms of all variances.
-_MAX_LEVEL = 14.0
-
 # Lower bound of the log variances of white noise and walk, relative to the log variance of an
 # increment. One matrix contains the precisions of white noise and walk, so smaller variances are
 # lost to rounding.
@@ -261,7 +258,7 @@ class NoiseModel:
         mean = levels.copy()
         precision = np.zeros(len(levels))
         lower = np.full(len(levels), np.log(MIN_VARIANCE))
-        upper = np.full(len(levels), _MAX_LEVEL)
+        upper = np.full(len(levels), np.inf)
         lower[WHITES] = np.maximum(lower[WHITES], total + _MIN_LOG_SHARE)
         lower[WALKS] = np.maximum(lower[WALKS], total + _MIN_LOG_SHARE)
         mean[JITTER] = tuning.jitter
