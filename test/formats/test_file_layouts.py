@@ -2,7 +2,6 @@
 forms of numbers and dates, and orders of columns a program writes them with.
 """
 
-import time
 from datetime import UTC, datetime
 
 import numpy as np
@@ -584,71 +583,3 @@ def test_what_cannot_be_read_gets_one_line(tmp_path, kind):
     with pytest.raises(InputError, match=message) as caught:
         read(written(tmp_path / "poses.txt", text))
     assert "\n" not in str(caught.value)
-
-
-HOSTILE = {
-    "header of brackets": "t,x["
-    + " " * 600
-    + ",y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
-    "long header of brackets": "t,x" + "[(" * 30_000 + "\n0,1\n",
-    "long header of blanks": "t,x[" + " " * 60_000 + "]]\n0,1\n",
-    "long number": "1" * 60_000 + "x,1,2,3,0,0,0,1\n",
-    "long decimal comma": "1" * 60_000 + ";" + "2" * 5_000 + "\n",
-    "long angle": "t,lat,lon,height\n0," + "1 " * 30_000 + ",0,0\n",
-    "long date": "2023-11-14 " + "1:" * 30_000 + " 1 2 3 0 0 0 1\n",
-    "long second column": "123456789,1," + "a" * 60_000 + "\n",
-    "many text lines": "a b c\n" * 200_000,
-    "many wide rows": ("1," * 30_000 + "1\n") * 60,
-}
-
-
-@pytest.mark.parametrize("kind", HOSTILE)
-def test_text_that_is_made_to_take_long_takes_seconds_at_most(tmp_path, kind):
-    path = written(tmp_path / "poses.csv", HOSTILE[kind])
-    began = time.process_time()
-    message = ""
-    try:
-        assert len(read(path).trajectory) == 1
-    except InputError as error:
-        message = str(error)
-    assert time.process_time() - began < 3.0
-    assert "\n" not in message
-    assert len(message) < 2_000
-
-
-def test_a_stamp_is_preferred_to_milliseconds_of_a_week_of_gps(tmp_path):
-    """Messages of a receiver in a csv: the time of the recording, and the week in the header."""
-    path = tmp_path / "inspvax.csv"
-    rows = [
-        f"{1_636_524_445_180_543_531 + 20_000_000 * k},2183,{269_353_560 + 20 * k},{k},0,0,0,0,0,1"
-        for k in range(30)
-    ]
-    names = "time,.header.gps_week,.header.gps_week_seconds,x,y,z,qx,qy,qz,qw"
-    path.write_text("\n".join([names, *rows, ""]))
-    trajectory = hec.read_trajectory(path, AUTO)
-    assert trajectory.stamps_ns[0] == 1_636_524_445_180_543_531
-    assert trajectory.interval_s == pytest.approx(0.02)
-
-
-def test_a_license_is_no_trajectory(tmp_path):
-    path = tmp_path / "LICENSE"
-    path.write_text(
-        "1. Definitions.\nLicense means the terms\nand conditions for use\n"
-    )
-
-    with pytest.raises(InputError, match="does not name the columns"):
-        hec.read_trajectory(path, "auto")
-
-
-def test_a_stamp_in_degrees_has_the_unit_of_its_size(tmp_path):
-    path = tmp_path / "odd.csv"
-    path.write_text("t [deg],x,y,z\n0.5,1,2,3\n1.5,1,2,4\n2.5,1,2,5\n")
-
-    with pytest.warns(UserWarning, match="positions only"):
-        trajectory = hec.read_trajectory(path, "auto")
-
-    assert trajectory.stamps_ns.tolist() == [
-        500_000_000,
-        1_500_000_000,
-        2_500_000_000,
-    ]

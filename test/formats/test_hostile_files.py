@@ -10,12 +10,14 @@ import xml.dom.minidom
 import motions
 import pytest
 import yaml
+from motions import read_trajectory_file
 from result_making import calibration
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.extras.fleet.batch import stored
 from hand_eye_calib.extras.fleet.work import Task
 from hand_eye_calib.formats.results import load_result, save_result
+from hand_eye_calib.formats.trajectory_files.file_options import AUTO
 from hand_eye_calib.formats.trajectory_files.writing import write_trajectory
 from hand_eye_calib.formats.yaml_files import read_yaml
 from hand_eye_calib.offline import calibrate as offline
@@ -352,3 +354,42 @@ def test_whole_numbers_of_yaml_are_of_64_bits(tmp_path, number):
     ) as caught:
         read_yaml(path)
     one_line(caught)
+
+
+def written(path, text):
+    path.write_bytes(text.encode())
+    return path
+
+
+def read(path, **options):
+    return read_trajectory_file(path, AUTO, repair=True, **options)
+
+
+SLOW_TEXTS = {
+    "header of brackets": "t,x["
+    + " " * 600
+    + ",y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n",
+    "long header of brackets": "t,x" + "[(" * 30_000 + "\n0,1\n",
+    "long header of blanks": "t,x[" + " " * 60_000 + "]]\n0,1\n",
+    "long number": "1" * 60_000 + "x,1,2,3,0,0,0,1\n",
+    "long decimal comma": "1" * 60_000 + ";" + "2" * 5_000 + "\n",
+    "long angle": "t,lat,lon,height\n0," + "1 " * 30_000 + ",0,0\n",
+    "long date": "2023-11-14 " + "1:" * 30_000 + " 1 2 3 0 0 0 1\n",
+    "long second column": "123456789,1," + "a" * 60_000 + "\n",
+    "many text lines": "a b c\n" * 200_000,
+    "many wide rows": ("1," * 30_000 + "1\n") * 60,
+}
+
+
+@pytest.mark.parametrize("kind", SLOW_TEXTS)
+def test_text_that_is_made_to_take_long_takes_seconds_at_most(tmp_path, kind):
+    path = written(tmp_path / "poses.csv", SLOW_TEXTS[kind])
+    began = time.process_time()
+    message = ""
+    try:
+        assert len(read(path).trajectory) == 1
+    except InputError as error:
+        message = str(error)
+    assert time.process_time() - began < 3.0
+    assert "\n" not in message
+    assert len(message) < 2_000

@@ -385,3 +385,41 @@ def test_published_files_need_no_options():
         for trajectory in (ins, theirs)
     ]
     assert_allclose(lengths[0].sum(), lengths[1].sum(), rtol=6e-4)
+
+
+def test_a_stamp_is_preferred_to_milliseconds_of_a_week_of_gps(tmp_path):
+    """Messages of a receiver in a csv: the time of the recording, and the week in the header."""
+    path = tmp_path / "inspvax.csv"
+    rows = [
+        f"{1_636_524_445_180_543_531 + 20_000_000 * k},2183,{269_353_560 + 20 * k},{k},0,0,0,0,0,1"
+        for k in range(30)
+    ]
+    names = "time,.header.gps_week,.header.gps_week_seconds,x,y,z,qx,qy,qz,qw"
+    path.write_text("\n".join([names, *rows, ""]))
+    trajectory = hec.read_trajectory(path, AUTO)
+    assert trajectory.stamps_ns[0] == 1_636_524_445_180_543_531
+    assert trajectory.interval_s == pytest.approx(0.02)
+
+
+def test_a_license_is_no_trajectory(tmp_path):
+    path = tmp_path / "LICENSE"
+    path.write_text(
+        "1. Definitions.\nLicense means the terms\nand conditions for use\n"
+    )
+
+    with pytest.raises(InputError, match="does not name the columns"):
+        hec.read_trajectory(path, "auto")
+
+
+def test_a_stamp_in_degrees_has_the_unit_of_its_size(tmp_path):
+    path = tmp_path / "odd.csv"
+    path.write_text("t [deg],x,y,z\n0.5,1,2,3\n1.5,1,2,4\n2.5,1,2,5\n")
+
+    with pytest.warns(UserWarning, match="positions only"):
+        trajectory = hec.read_trajectory(path, "auto")
+
+    assert trajectory.stamps_ns.tolist() == [
+        500_000_000,
+        1_500_000_000,
+        2_500_000_000,
+    ]

@@ -5,7 +5,6 @@ with the input.
 import dataclasses
 import functools
 import hashlib
-import io
 import json
 import os
 import re
@@ -32,14 +31,7 @@ from hand_eye_calib.core.results.records import Severity
 from hand_eye_calib.formats.bags.writer import write_bag
 from hand_eye_calib.formats.results import load_result
 from hand_eye_calib.offline.cli.main import main
-from hand_eye_calib.offline.cli.options import (
-    fail,
-    note,
-    print_result,
-    typed_options,
-    waiting_for,
-    with_progress,
-)
+from hand_eye_calib.offline.cli.options import fail, print_result
 from hand_eye_calib.offline.cli.present import as_lines
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -552,38 +544,6 @@ def test_a_reader_that_goes_away_is_no_error_and_files_are_written(
     assert (tmp_path / "out" / "report.html").exists()
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_progress_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
-    assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
-    assert capsys.readouterr().err == ""
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setenv("TERM", "xterm")
-    assert list(with_progress(range(20), 20, "reading")) == list(range(20))
-    shown = terminal.getvalue()
-    assert "reading" in shown
-    assert "\x1b[2K" in shown.rpartition("reading")[2]  # wiped out
-    with waiting_for("solving"):
-        assert terminal.getvalue().endswith("solving ...")
-    assert terminal.getvalue().endswith("\r\033[K")
-
-
-def test_messages_name_options_as_they_are_typed(capsys):
-    message = "raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3"
-    note(message, "give `scale` or `child_columns`, not `this`")
-    fail("keyframe.min_interval: no scale", 1)
-    assert capsys.readouterr().err == (
-        "hand_eye_calib: note: raise --max-gap, or give --prior z; see 'max_gap' in "
-        "/data/max_gap.txt and time_offset=3\n"
-        "hand_eye_calib: note: give --scale or --child-columns, not `this`\n"
-        "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
-    )
-
-
 def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     hostile = "cam\x1b[2Jera\nStatus: ok"
     print_result(
@@ -596,16 +556,4 @@ def test_control_characters_in_names_do_not_reach_the_terminal(capsys):
     assert (
         capsys.readouterr().err
         == "hand_eye_calib: error: cam\\x1b[2Jera\\nStatus: ok\n"
-    )
-
-
-def test_options_are_printed_as_they_are_typed():
-    options = {
-        "prior.z": "VALUE+/-SIGMA",
-        "max_gap": 0.2,
-        "target.translation": 0.01,
-    }
-    typed = typed_options(options.items())
-    assert (
-        typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"
     )

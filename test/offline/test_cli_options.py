@@ -1,8 +1,10 @@
 """Options of the commands: help, values, configuration files."""
 
 import dataclasses
+import io
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,13 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.registry import COMMANDS
 from hand_eye_calib.offline.cli.main import main
+from hand_eye_calib.offline.cli.options import (
+    fail,
+    note,
+    typed_options,
+    waiting_for,
+    with_progress,
+)
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -263,3 +272,47 @@ def test_the_truth_of_a_simulation_is_compared_whatever_its_ending(
 
     assert main(["compare", result, "--with", str(tmp_path / name)]) == 0
     assert "same" in capsys.readouterr().out
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_is_shown_on_a_terminal_and_wiped_out(monkeypatch, capsys):
+    assert list(with_progress(range(3), 3, "reading")) == [0, 1, 2]
+    assert capsys.readouterr().err == ""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    assert list(with_progress(range(20), 20, "reading")) == list(range(20))
+    shown = terminal.getvalue()
+    assert "reading" in shown
+    assert "\x1b[2K" in shown.rpartition("reading")[2]  # wiped out
+    with waiting_for("solving"):
+        assert terminal.getvalue().endswith("solving ...")
+    assert terminal.getvalue().endswith("\r\033[K")
+
+
+def test_messages_name_options_as_they_are_typed(capsys):
+    message = "raise max_gap, or give prior.z; see 'max_gap' in /data/max_gap.txt and time_offset=3"
+    note(message, "give `scale` or `child_columns`, not `this`")
+    fail("keyframe.min_interval: no scale", 1)
+    assert capsys.readouterr().err == (
+        "hand_eye_calib: note: raise --max-gap, or give --prior z; see 'max_gap' in "
+        "/data/max_gap.txt and time_offset=3\n"
+        "hand_eye_calib: note: give --scale or --child-columns, not `this`\n"
+        "hand_eye_calib: error: --keyframe-min-interval: no scale\n"
+    )
+
+
+def test_options_are_printed_as_they_are_typed():
+    options = {
+        "prior.z": "VALUE+/-SIGMA",
+        "max_gap": 0.2,
+        "target.translation": 0.01,
+    }
+    typed = typed_options(options.items())
+    assert (
+        typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"
+    )

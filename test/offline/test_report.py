@@ -38,7 +38,6 @@ from hand_eye_calib.offline.cli import main as cli
 from hand_eye_calib.offline.cli.reporting import write_report
 from hand_eye_calib.offline.report import evidence
 from hand_eye_calib.offline.report.report import render
-from hand_eye_calib.offline.report.views import VIEWS, VIEWS_OF_VEHICLE
 
 FIGURES = ("views", "trajectories", "coordinates", "residuals", "streams")
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -395,22 +394,6 @@ def test_command_writes_it_beside_the_result(files, tmp_path, capsys):
     assert str(tmp_path) not in page.text
 
 
-def test_streams_are_shown_on_one_clock_and_in_one_unit():
-    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
-    seen = evidence.view_streams(drive.parent, drive.child, 0.5)
-    (times_p, rates_p), (times_c, rates_c) = seen.rates
-    assert (
-        np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p))
-        < 0.01
-        < rates_p.max()
-    )
-    assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
-    holed = evidence.view_streams(
-        drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5
-    )
-    assert [len(spans) for spans in holed.spans_s] == [1, 2]
-
-
 @pytest.mark.usefixtures("no_figures")
 def test_what_is_installed_is_compared_axis_by_axis_and_an_axis_may_have_its_own_target(
     planar, tmp_path
@@ -537,19 +520,6 @@ def test_no_sentence_speaks_against_a_green_verdict():
     assert green >= 55
 
 
-def test_views_are_named_by_where_one_looks_from():
-    from_where = {
-        "from above": [0, 0, 1],
-        "from the side": [0, -1, 0],
-        "from the front": [1, 0, 0],
-    }
-    for (across, up), name in VIEWS_OF_VEHICLE.items():
-        axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
-        assert np.cross(*axes).tolist() == from_where[name]
-        (other,) = set("xyz") - {across, up}
-        assert VIEWS[across + up] == f"along {other}"
-
-
 def with_optical_parent(snapshot):
     """Snapshot and calibration of the same drive whose parent has z forward and y down."""
     parent, child = snapshot.streams
@@ -585,43 +555,6 @@ def test_both_streams_coincide_at_every_pitch():
     assert about_y == pytest.approx(-about_z, abs=1e-6)
 
 
-@pytest.mark.parametrize("unknown", ["x", "y", "z"])
-def test_an_unknown_axis_is_a_line_along_that_axis(unknown):
-    sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
-    covariance = np.diag(np.full(6, 1e-6))
-    covariance["xyz".index(unknown)] = np.inf
-    result = calibration(
-        T_parent_child=se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])),
-        covariance_measured=covariance,
-        observability_measured=dofs(sigmas, unknown),
-    )
-    place = dict(zip("xyz", result.translation, strict=True))
-    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
-        lines = ends_of_dashed_lines(panel)
-        assert len(lines) == (unknown in axes)
-        for ends in lines:
-            for axis, coordinates in zip(axes, ends.T, strict=True):
-                if axis == unknown:
-                    assert np.ptp(coordinates) > 0.1
-                else:
-                    assert coordinates == pytest.approx(place[axis])
-
-
-def ends_of_dashed_lines(panel):
-    """Both ends of each dashed line where the panel shows it, (2, 2), in metres.
-
-    The class of an endless line is private before matplotlib 3.9, so the drawn ends are read.
-    """
-    panel.figure.canvas.draw()
-    to_metres = panel.transData.inverted()
-    ends = []
-    for line in panel.lines:
-        if line.get_linestyle() == "--":
-            drawn = line.get_transform().transform(line.get_xydata())
-            ends.append(to_metres.transform(drawn))
-    return ends
-
-
 @pytest.mark.parametrize("unknown", ["x", "yaw"])
 def test_a_notebook_gets_the_numbers_of_a_result_with_an_unknown_axis(unknown):
     sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
@@ -633,25 +566,6 @@ def test_a_notebook_gets_the_numbers_of_a_result_with_an_unknown_axis(unknown):
     html = result._repr_html_()
     assert result.headline in html
     assert f">{unknown}</th>" in html
-
-
-def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
-    direction = np.array([0.6, 0.0, 0.8])
-    in_parent = np.diag(np.full(3, 1e-6)) + 9.0 * np.outer(direction, direction)
-    covariance = np.diag(np.full(6, 1e-6))
-    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
-    covariance[:3, :3] = T[:3, :3].T @ in_parent @ T[:3, :3]
-    result = calibration(
-        T_parent_child=T,
-        covariance_measured=covariance,
-        observability_measured=dofs([np.inf, 1e-3, np.inf, 1e-3, 1e-3, 1e-3]),
-    )
-    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
-        (ends,) = ends_of_dashed_lines(panel)
-        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-        expected = direction[["xyz".index(axis) for axis in axes]]
-        expected /= np.linalg.norm(expected)
-        assert abs(along @ expected) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("of", ["poses", "stops"])

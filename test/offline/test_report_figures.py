@@ -9,15 +9,21 @@ import pytest
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from matplotlib.figure import Figure
 
+import pytest
+from matplotlib.figure import Figure
+from result_making import NAMES, calibration, dofs
+
+import hand_eye_calib as hec
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.simulation.demo import DRIVE
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import REALISTIC
 from hand_eye_calib.offline.report import evidence
 from hand_eye_calib.offline.report.figures import figures_of
 from hand_eye_calib.offline.report.style import LOOK, recordings_axis
+from hand_eye_calib.offline.report.views import VIEWS, VIEWS_OF_VEHICLE
 
 
 def points_of(svg):
@@ -105,3 +111,88 @@ def test_recordings_of_one_time_are_drawn_by_their_number():
     places = recordings_axis([panel], [0, 0, 0], "recording")
     assert places.tolist() == [1.0, 2.0, 3.0]
     assert panel.get_xlabel() == "number of the recording"
+
+
+def test_streams_are_shown_on_one_clock_and_in_one_unit():
+    drive = simulate_drive(3, dataclasses.replace(DRIVE, poses=200))
+    seen = evidence.view_streams(drive.parent, drive.child, 0.5)
+    (times_p, rates_p), (times_c, rates_c) = seen.rates
+    assert (
+        np.median(np.abs(np.interp(times_p, times_c, rates_c) - rates_p))
+        < 0.01
+        < rates_p.max()
+    )
+    assert [spans.shape for spans in seen.spans_s] == [(1, 2), (1, 2)]
+    holed = evidence.view_streams(
+        drive.parent, drive.child[np.r_[0:100, 150:400]], 0.5
+    )
+    assert [len(spans) for spans in holed.spans_s] == [1, 2]
+
+
+def test_views_are_named_by_where_one_looks_from():
+    from_where = {
+        "from above": [0, 0, 1],
+        "from the side": [0, -1, 0],
+        "from the front": [1, 0, 0],
+    }
+    for (across, up), name in VIEWS_OF_VEHICLE.items():
+        axes = np.eye(3)[["xyz".index(across), "xyz".index(up)]]
+        assert np.cross(*axes).tolist() == from_where[name]
+        (other,) = set("xyz") - {across, up}
+        assert VIEWS[across + up] == f"along {other}"
+
+
+@pytest.mark.parametrize("unknown", ["x", "y", "z"])
+def test_an_unknown_axis_is_a_line_along_that_axis(unknown):
+    sigmas = np.where([name == unknown for name in NAMES], np.inf, 1e-3)
+    covariance = np.diag(np.full(6, 1e-6))
+    covariance["xyz".index(unknown)] = np.inf
+    result = calibration(
+        T_parent_child=se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])),
+        covariance_measured=covariance,
+        observability_measured=dofs(sigmas, unknown),
+    )
+    place = dict(zip("xyz", result.translation, strict=True))
+    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
+        lines = ends_of_dashed_lines(panel)
+        assert len(lines) == (unknown in axes)
+        for ends in lines:
+            for axis, coordinates in zip(axes, ends.T, strict=True):
+                if axis == unknown:
+                    assert np.ptp(coordinates) > 0.1
+                else:
+                    assert coordinates == pytest.approx(place[axis])
+
+
+def ends_of_dashed_lines(panel):
+    """Both ends of each dashed line where the panel shows it, (2, 2), in metres.
+
+    The class of an endless line is private before matplotlib 3.9, so the drawn ends are read.
+    """
+    panel.figure.canvas.draw()
+    to_metres = panel.transData.inverted()
+    ends = []
+    for line in panel.lines:
+        if line.get_linestyle() == "--":
+            drawn = line.get_transform().transform(line.get_xydata())
+            ends.append(to_metres.transform(drawn))
+    return ends
+
+
+def test_an_unknown_direction_between_axes_is_drawn_as_it_is():
+    direction = np.array([0.6, 0.0, 0.8])
+    in_parent = np.diag(np.full(3, 1e-6)) + 9.0 * np.outer(direction, direction)
+    covariance = np.diag(np.full(6, 1e-6))
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    covariance[:3, :3] = T[:3, :3].T @ in_parent @ T[:3, :3]
+    result = calibration(
+        T_parent_child=T,
+        covariance_measured=covariance,
+        observability_measured=dofs([np.inf, 1e-3, np.inf, 1e-3, 1e-3, 1e-3]),
+    )
+    for panel, axes in zip(hec.plot(result).axes, VIEWS, strict=True):
+        (ends,) = ends_of_dashed_lines(panel)
+        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        expected = direction[["xyz".index(axis) for axis in axes]]
+        expected /= np.linalg.norm(expected)
+        assert abs(along @ expected) == pytest.approx(1.0)

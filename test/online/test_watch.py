@@ -3,8 +3,6 @@
 import copy
 import io
 import json
-import queue
-import time
 from dataclasses import replace
 
 import pytest
@@ -29,12 +27,8 @@ from hand_eye_calib.core.base.plain import from_plain, plain
 from hand_eye_calib.core.results import context
 from hand_eye_calib.core.results.context import Comparison, Difference
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
-from hand_eye_calib.online.live.state import (
-    Broadcast,
-    Level,
-    NodeState,
-)
-from hand_eye_calib.online.ros.watch import Session, _display
+from hand_eye_calib.online.live.state import Broadcast, Level, NodeState
+from hand_eye_calib.online.ros.watch import _display
 from hand_eye_calib.online.watch import terminal
 from hand_eye_calib.online.watch.board import AXES, Board, Tone, state_of
 from hand_eye_calib.online.watch.web import fragment
@@ -585,49 +579,6 @@ def test_a_line_is_printed_when_something_else_is_said(capsys):
         board.answer("save", True, "result saved", 5.0)
         assert printed(learning[0], 5.0) == ["✓ save: result saved"]
         assert board.view(60.0).answer == ()
-
-
-@pytest.fixture
-def typed():
-    """A session at a terminal: function that types keys and returns the view."""
-    board = Board()
-    requests = queue.SimpleQueue()
-    keys = []
-    board.take(state(), time.monotonic())
-    session = Session(board, requests, lambda: keys.pop() if keys else "")
-
-    def type_keys(text):
-        keys.append(text)
-        return session.view()
-
-    type_keys.session = session
-    type_keys.requests = requests
-    type_keys.board = board
-    return type_keys
-
-
-def test_keys_ask_and_a_reset_takes_two(typed):
-    typed("sx9w")
-    assert [typed.requests.get(), typed.requests.get()] == ["solve", "save"]
-    assert typed("r").answer[0].text == "forgets all poses: press r again"
-    typed("ca")  # no mount has moved
-    assert typed.requests.empty()
-    typed("r")
-    assert typed.requests.get() == "reset"
-    typed.board.take(
-        mount(**ERROR, text="moved", since_ns=10**18), time.monotonic()
-    )
-    typed("ca")
-    typed("c")
-    assert [typed.requests.get() for _ in range(2)] == [
-        "acknowledge",
-        "recalibrate",
-    ]
-    assert (typed.session.is_over, typed.session.shows_code) == (False, False)
-    typed("p")
-    assert typed.session.shows_code
-    typed("q")
-    assert typed.session.is_over
 
 
 def test_a_busy_computer_is_named_beside_the_advice_that_waits_for_its_result():

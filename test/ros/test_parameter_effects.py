@@ -19,6 +19,7 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 from numpy.testing import assert_allclose
+from parameter_values import CHANGES, GIVEN, TOGETHER
 from source_code import ROOT
 
 import hand_eye_calib as hec
@@ -29,42 +30,8 @@ from hand_eye_calib.formats.journal import has_session
 from hand_eye_calib.offline.cli.main import main
 
 QUIET = ["-p solve_period:=1000.0", *ros_harness.RELIABLE_INPUTS]
-LAX = {"threshold": 1e-9}
 STREAMS = ("parent", "child")
 T_PARENT_REAR = se3.exp(np.array([-1.0, 0.1, 0.3, 0.2, 0.1, 2.5]))
-
-# Parameters that change the answer while the node runs: another value, and what has to be set
-# beforehand for it to matter.
-CHANGES = {
-    "method": ("park", {}),
-    "reference": ("B7", {}),
-    "backend": ("ipopt", {}),
-    "threshold": (1e-5, {}),
-    "min_inlier_fraction": (0.9, LAX),
-    "min_pairs": (1000, {}),
-    "max_pairs": (50, {}),
-    "keyframe.min_translation": (0.5, {}),
-    "keyframe.min_rotation": (0.3, {}),
-    "keyframe.min_interval": (0.45, {}),
-    "max_gap": (0.05, {}),
-    "time_offset": (0.03, {}),
-    "scale": (2, {}),
-    "parent_scale": (1.5, {}),
-    **{f"{stream}_invert": ("poses", {}) for stream in STREAMS},
-    **{f"{stream}_quaternion": ("wxyz", {}) for stream in STREAMS},
-    **{f"{stream}_kind": ("exact", {}) for stream in STREAMS},
-    "target.translation": (1e-5, {}),
-    "target.rotation": (1e-5, {}),
-    "target.axes": ("yaw=1e-5", {}),
-    # Streams without wheel data are refused.
-    "nominal_radius": (0.1, {}),
-    "nominal_separation": (0.5, {}),
-    **{f"prior.{axis}": ("1+/-0.001", {}) for axis in "xyz"},
-    **{
-        f"prior.{axis}": ("10deg+/-0.01deg", {})
-        for axis in ("roll", "pitch", "yaw")
-    },
-}
 
 
 @pytest.fixture(scope="module")
@@ -394,41 +361,6 @@ def test_no_parameter_is_left_out():
 
 # ---------------------------------------- the launch file, wherever ROS's launch is installed
 
-# Of every parameter a value that is not its default, as typed on the command line and as a ROS
-# parameter.
-GIVEN = {name: (str(value), value) for name, (value, _) in CHANGES.items()} | {
-    "threshold": ("1", 1.0),
-    "min_inlier_fraction": ("1", 1.0),
-    "time_offset": ("estimate", "estimate"),
-    "target.translation": ("0.1", 0.1),
-    "target.rotation": ("0.01", 0.01),
-    "parent_frame": ("123", "123"),
-    "child_frame": ("true", "true"),
-    "solve_period": ("4", 4.0),
-    "parent_type": ("nav_msgs/msg/Odometry", "nav_msgs/msg/Odometry"),
-    "child_type": (
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/PoseStamped",
-    ),
-    "output_directory": ("{folder}/out", "{folder}/out"),
-    "journal": ("off", "off"),
-    "publish_tf": ("true", True),
-    **{f"{stream}_measures": ("poses", "poses") for stream in STREAMS},
-    **{
-        f"{stream}_tf": (f"odom:{stream}", f"odom:{stream}")
-        for stream in STREAMS
-    },
-    "other_children": ("2", 2),
-    "report": ("false", False),
-    "installed": ("1 0 0 0 0 0", "1 0 0 0 0 0"),
-    "base_frame": ("base_link", "base_link"),
-    "monitor": ("true", True),
-    "enabled": ("false", False),
-    "lifecycle": ("true", True),
-}
-
-# monitor watches one child sensor.
-TOGETHER = [set(GIVEN) - {"monitor"}, {"monitor", "installed"}]
 
 LAUNCH = """
 import sys
@@ -443,7 +375,6 @@ service.include_launch_description(
 )
 sys.exit(service.run())
 """
-
 
 LAUNCHER = [
     sys.executable,
