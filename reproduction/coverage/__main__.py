@@ -89,18 +89,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.page:
             arguments.page.write_text(text, encoding="utf-8")
         if arguments.rows:
-            names = ("table", "name", "method")
-            named = [
-                {name: getattr(row, name) for name in names} for row in rows
-            ]
-            values = [{kind: row.value(kind) for kind in KINDS} for row in rows]
-            write_csv(
-                arguments.rows,
-                [{**a, **b} for a, b in zip(named, values, strict=True)],
-            )
+            write_csv(arguments.rows, [_record_of(row) for row in rows])
         return 0
 
     return exit_code_of(run)
+
+
+def _record_of(row: Row) -> dict[str, object]:
+    """Return the values of a row by the names of the columns of a CSV file."""
+    names = {name: getattr(row, name) for name in ("table", "name", "method")}
+    values = {kind: row.value(kind) for kind in KINDS}
+    return {**names, **values}
 
 
 def measure(

@@ -150,9 +150,12 @@ def image_messages(stamp_ns, image):
     yield stamp_ns, "/eye/camera_info", info.__msgtype__, lambda _: info
 
 
-def test_the_images_of_a_bag_are_poses_of_the_camera(
-    tmp_path, capsys, no_figures
-):
+BOARD = "charuco:7x5:0.05:0.037:5X5_100"
+X_HAND_EYE = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
+
+
+def bag_of_hand_and_eye(path):
+    """A bag with poses of a hand and images of its camera, and the target's poses (16, 4, 4)."""
     rng = np.random.default_rng(7)
     count = 16
     times = np.arange(count) / 6
@@ -163,10 +166,8 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(
     Rs = Rotation.from_rotvec(turns).as_matrix()
     far = [0.0, 0.0, 0.62]
     Ts = se3.from_rotation_translation(Rs, far - Rs @ [0.175, 0.125, 0.0])
-    X = se3.exp([0.03, -0.05, 0.08, 0.2, -0.4, 1.2])
-    hand = Trajectory(
-        stamps_ns, se3.inverse(Ts) @ se3.inverse(X), "hand", "base"
-    )
+    Ts_base_hand = se3.inverse(Ts) @ se3.inverse(X_HAND_EYE)
+    hand = Trajectory(stamps_ns, Ts_base_hand, "hand", "base")
     messages = [
         (
             stamp_ns,
@@ -181,13 +182,16 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(
     picture = charuco_picture()
     for stamp_ns, T in zip(stamps_ns.tolist(), Ts, strict=True):
         messages += image_messages(stamp_ns, rendered(picture, T, rng))
-    bag = write_messages(tmp_path / "bag", messages)
-    board = "charuco:7x5:0.05:0.037:5X5_100"
+    return write_messages(path, messages), Ts
+
+
+def test_the_images_of_a_bag_are_poses_of_the_camera(tmp_path, no_figures):
+    bag, Ts = bag_of_hand_and_eye(tmp_path / "bag")
     with pytest.warns(
         UserWarning,
         match="visible in 16 of 16 images, with corner residuals of 0[.]",
     ):
-        trajectory = hec.read_trajectory(bag, topic=f"/eye/image_raw?{board}")
+        trajectory = hec.read_trajectory(bag, topic=f"/eye/image_raw?{BOARD}")
     off = se3.log(Ts @ trajectory.poses)
     assert np.median(np.abs(off[:, :3])) < 1e-3
     assert np.degrees(np.median(np.abs(off[:, 3:]))) < 0.1
@@ -198,30 +202,22 @@ def test_the_images_of_a_bag_are_poses_of_the_camera(
     (tmp_path / "camera.yaml").write_text(CAMERA_INFO)
     with PoseBag(bag) as opened:
         of_file = (
-            f"/eye/image_raw/compressed?{board}@{tmp_path / 'camera.yaml'}"
+            f"/eye/image_raw/compressed?{BOARD}@{tmp_path / 'camera.yaml'}"
         )
         assert_array_equal(
             opened.trajectory(of_file)[0].poses, trajectory.poses
         )
         for topic, message in (
             ("/eye/image_raw", "name the target in the images"),
-            (f"/hand?{board}", "contains no images"),
+            (f"/hand?{BOARD}", "contains no images"),
         ):
             with pytest.raises(InputError, match=message):
                 opened.trajectory(topic)
-    topics = [
-        "--parent-topic",
-        "/hand",
-        "--child-topic",
-        "/eye/image_raw",
-        "--target",
-        board,
-    ]
-    assert (
-        main(["calibrate", str(bag), *topics, "--out", str(tmp_path / "out")])
-        == 0
-    )
-    error = se3.log(se3.inverse(X) @ hec.load(tmp_path / "out").T_parent_child)
+    topics = ["--parent-topic", "/hand", "--child-topic", "/eye/image_raw"]
+    options = [*topics, "--target", BOARD, "--out", str(tmp_path / "out")]
+    assert main(["calibrate", str(bag), *options]) == 0
+    result = hec.load(tmp_path / "out")
+    error = se3.log(se3.inverse(X_HAND_EYE) @ result.T_parent_child)
     assert np.abs(error[:3]).max() < 3e-3
     assert np.degrees(np.abs(error[3:]).max()) < 0.2
 

@@ -69,6 +69,22 @@ def made(name, *values, **more):
     )
 
 
+# Types of the messages, by the topics of the bag.
+TYPES = {
+    "/twist": TWIST,
+    "/fix": FIX,
+    "/imu": IMU,
+    "/px4": PX4,
+    "/array": ARRAY,
+    "/geo": GEO,
+    "/ins": INS,
+    "/twists": f"{TWIST[:-7]}WithCovarianceStamped",
+    "/bodies": BODIES,
+    "/named": NAMED_ARRAY,
+    "/gps": GPS,
+}
+
+
 def messages():
     """Topic and type to the messages of all stamps."""
     lat, lon, height = GEODETIC
@@ -78,20 +94,12 @@ def messages():
     )
     status = made("sensor_msgs/msg/NavSatStatus", 0, 1)
     rpy = np.degrees(se3.rotation_to_rpy(TRUTH.poses[:, :3, :3]))
+    # Roll, pitch downwards and heading from north.
+    attitudes = np.c_[rpy[:, 0], -rpy[:, 1], 90.0 - rpy[:, 2]]
     px4 = [
         *zip(P.astype("f4"), np.roll(Q, 1, axis=1).astype("f4"), strict=True)
     ]
-    types = {
-        "/twist": TWIST,
-        "/fix": FIX,
-        "/imu": IMU,
-        "/px4": PX4,
-        "/array": ARRAY,
-        "/geo": GEO,
-    }
-    types |= {"/ins": INS, "/twists": f"{TWIST[:-7]}WithCovarianceStamped"}
-    types |= {"/bodies": BODIES, "/named": NAMED_ARRAY, "/gps": GPS}
-    written = {key: [] for key in types.items()}
+    written = {key: [] for key in TYPES.items()}
     zero = made("Vector3", 0.0, 0.0, 0.0)
     nine = np.zeros(9)
     nothing = np.zeros(3, "f4")
@@ -107,7 +115,7 @@ def messages():
         point = made(POINT, lat[k], lon[k], height[k])
         fields = {
             TWIST: (head, twist),
-            types["/twists"]: (
+            TYPES["/twists"]: (
                 head,
                 made("TwistWithCovariance", twist, np.zeros(36)),
             ),
@@ -119,15 +127,7 @@ def messages():
             ARRAY: (head, [pose, pose]),
             GEO: (head, made(POSE, point, quaternion)),
             GPS: (head, lat[k], lon[k], height[k]),
-            INS: (
-                head,
-                lat[k],
-                lon[k],
-                height[k],
-                rpy[k, 0],
-                -rpy[k, 1],
-                90.0 - rpy[k, 2],
-            ),
+            INS: (head, lat[k], lon[k], height[k], *attitudes[k]),
         }
         for key in written:
             written[key].append(made(key[1], *fields[key[1]]))

@@ -358,7 +358,8 @@ def test_the_pose_has_the_angles_as_printed_with_their_own_standard_deviations()
     assert (gone.title, gone.values, gone.buttons) == ("", (), ("reset",))
 
 
-def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
+def a_mount_that_has_moved():
+    """Comparison with what is installed: all axes have moved, and one sigma is unknown."""
     differs = context.AxisDifference(
         difference=0.031, sigma=0.004, visible=0.01, verdict="moved"
     )
@@ -369,11 +370,15 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
         first="a", second="b", verdict="moved", sentence="", axes=axes
     )
     difference = replace(difference, change="z by +3 cm +/- 4 mm")
-    comparison = Comparison(
+    return Comparison(
         sentence="moved: z by +3 cm +/- 4 mm",
         verdict="moved",
         differences=(difference,),
     )
+
+
+def test_verdict_reasons_and_comparison_have_a_sign():
+    comparison = a_mount_that_has_moved()
     done = {"at": {"done": True, "precision": "known"}}
     careful = replace(EXTRINSIC, result=CAREFUL)
     view = view_of(state(comparison=comparison, extrinsic=careful, **done))
@@ -412,25 +417,25 @@ def test_verdict_reasons_comparison_and_broadcast_have_a_sign():
     for verdict, tone in (("same", Tone.GOOD), ("cannot tell", Tone.UNKNOWN)):
         other = replace(comparison, verdict=verdict)
         assert view_of(state(comparison=other)).result[2].tone is tone
-    for broadcast, tone in (
+
+
+@pytest.mark.parametrize(
+    ("broadcast", "tone"),
+    [
         (Broadcast.ON, Tone.GOOD),
         (Broadcast.REFUSED, Tone.ACT),
         (Broadcast.WITHDRAWN, Tone.ACT),
-    ):
-        extrinsic = replace(
-            EXTRINSIC, tf_static=broadcast, tf_static_reason="why"
-        )
-        # After the end of the node, late subscribers receive nothing.
-        for has_ended, expected in ((False, tone), (True, Tone.ACT)):
-            line = view_of(
-                replace(state(extrinsic=extrinsic), has_ended=has_ended)
-            ).result[2]
-            assert (line.tone, line.name) == (
-                expected,
-                "sent to other programs",
-            )
-            texts = "nothing" in line.text, line.text.endswith(": why")
-            assert texts == (has_ended, not has_ended)
+    ],
+)
+def test_a_broadcast_has_a_sign(broadcast, tone):
+    extrinsic = replace(EXTRINSIC, tf_static=broadcast, tf_static_reason="why")
+    # After the end of the node, late subscribers receive nothing.
+    for has_ended, expected in ((False, tone), (True, Tone.ACT)):
+        seen_state = replace(state(extrinsic=extrinsic), has_ended=has_ended)
+        line = view_of(seen_state).result[2]
+        assert (line.tone, line.name) == (expected, "sent to other programs")
+        texts = "nothing" in line.text, line.text.endswith(": why")
+        assert texts == (has_ended, not has_ended)
 
 
 def test_a_session_is_done_with_the_reason_of_its_verdict():

@@ -253,13 +253,8 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
 
     def both_go_on():
         stamp_ns = next(later_ns)
-        newest = zip(
-            publishers,
-            (Ts_pw_p[-1], Ts_cw_c[-1]),
-            ("lidar", "camera"),
-            strict=True,
-        )
-        for publisher, T, frame in newest:
+        newest = (Ts_pw_p[-1], "lidar"), (Ts_cw_c[-1], "camera")
+        for publisher, (T, frame) in zip(publishers, newest, strict=True):
             publisher.publish(message(publisher.msg_type, stamp_ns, T, frame))
 
     def has_result(document):
@@ -295,18 +290,16 @@ def test_a_dead_publisher_pauses_the_session_and_a_second_one_is_named(
             document.progress.is_paused and document.inputs["child"].is_paused
         )
 
-    child = state(is_paused, "the pause", only_the_parent_goes_on)
-    assert child.progress.is_paused
-    assert child.progress.level is Level.WARN
+    paused = state(is_paused, "the pause", only_the_parent_goes_on)
+    assert paused.progress.is_paused
+    assert paused.progress.level is Level.WARN
     gone = "it has no publisher any more"
-    child = state(
+    left = state(
         lambda document: gone in document.inputs["child"].text,
         "the end of the publisher",
     )
-    assert (child.inputs["child"].publishers, child.inputs["child"].level) == (
-        0,
-        Level.WARN,
-    )
+    child = left.inputs["child"]
+    assert (child.publishers, child.level) == (0, Level.WARN)
 
 
 def test_too_little_driving_is_said_also_where_time_does_not_run(

@@ -281,6 +281,18 @@ class TestRefusedInput:
         assert node.log.count("\n") == 1
 
 
+def received_and_lost(statuses):
+    """Numbers of messages received and lost of both inputs; empty until they are known."""
+    values = [
+        values_of(status)
+        for name, status in statuses.items()
+        if name.endswith(" input")
+    ]
+    if len(values) < 2 or any(row["lost"] == "unknown" for row in values):
+        return []
+    return [[int(row[key]) for key in ("messages", "lost")] for row in values]
+
+
 class TestLoss:
     """Messages that are lost on the way are counted, to within two in a hundred."""
 
@@ -317,33 +329,23 @@ class TestLoss:
             """
             if next(calls) % 50 == 0:
                 send(1)
-            values = [
-                values_of(status)
-                for name, status in statuses.items()
-                if name.endswith(" input")
-            ]
-            if len(values) < 2 or any(
-                row["lost"] == "unknown" for row in values
-            ):
-                return []
-            return [
-                [int(row[key]) for key in ("messages", "lost")]
-                for row in values
-            ]
+            return received_and_lost(statuses)
+
+        def is_all_accounted_for():
+            """Of n_before, an unknown number was sent before the subscriptions."""
+            for received, lost in told() or [(0, 0)]:
+                excess = received + lost - n_sent
+                slack = 0.02 * lost
+                if lost < 500 or not -n_before - slack <= excess <= slack:
+                    return False
+            return True
 
         peer.spin_until(told, "both inputs to receive")
-        n_before = n_sent  # of these, an unknown number went out before the subscriptions
+        n_before = n_sent
         node.process.send_signal(signal.SIGSTOP)
         send(3800)
         node.process.send_signal(signal.SIGCONT)
         peer.spin_until(
-            lambda: all(
-                lost >= 500
-                and -n_before - 0.02 * lost
-                <= received + lost - n_sent
-                <= 0.02 * lost
-                for received, lost in told() or [(0, 0)]
-            ),
-            "all messages to be received or lost",
+            is_all_accounted_for, "all messages to be received or lost"
         )
         node.wait_for_log("of the messages are lost. Free processor time")

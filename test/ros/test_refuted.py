@@ -39,6 +39,17 @@ def drive_over_ramps(n_poses=300, flat_s=12.0):
     return stamps_ns, disturbed(Ts_pw_p, 2, 1e-3, 7e-4), Ts_cw_c
 
 
+def assert_both_advise_a_remedy(statuses):
+    endings = {
+        "extrinsic": "check value, unit and sign of prior.z, or remove it",
+        "progress": "Correct it (value, unit, sign), or remove it.",
+    }
+    for name in endings:
+        status = statuses[f"/calibrator: {name}"]
+        assert status.level == status.WARN
+        assert status.message.endswith(endings[name])
+
+
 def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     start_node, peer, tmp_path
 ):
@@ -56,9 +67,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     _, early = peer.solve(
         publishers, stamps_ns[:100], Ts_pw_p[:100], Ts_cw_c[:100]
     )
-    assert matrix(early)[2, 3] == pytest.approx(
-        WRONG_Z, abs=0.02
-    )  # of the prior alone
+    # Of the prior alone.
+    assert matrix(early)[2, 3] == pytest.approx(WRONG_Z, abs=0.02)
 
     peer.feed(publishers, stamps_ns[100:], Ts_pw_p[100:], Ts_cw_c[100:])
     sentence = "the prior on z is"
@@ -72,27 +82,13 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
         "the advice",
     )
     answer = peer.trigger("solve")
-    assert (
-        answer.success,
-        answer.message.startswith("DO NOT USE: the prior on z"),
-    ) == (
-        False,
-        True,
-    )
-    endings = {
-        "extrinsic": "check value, unit and sign of prior.z, or remove it",
-        "progress": "Correct it (value, unit, sign), or remove it.",
-    }
-    for name in endings:
-        status = statuses[f"/calibrator: {name}"]
-        assert status.level == status.WARN
-        assert status.message.endswith(endings[name])
+    assert not answer.success
+    assert answer.message.startswith("DO NOT USE: the prior on z")
+    assert_both_advise_a_remedy(statuses)
     values = values_of(statuses["/calibrator: extrinsic"])
     assert (values["standing"], values["contradicted"]) == ("refuted", "z")
-    assert (
-        json.loads(states[-1].data)["extrinsic"]["result"]["verdict"]
-        == "DO NOT USE"
-    )
+    result = json.loads(states[-1].data)["extrinsic"]["result"]
+    assert result["verdict"] == "DO NOT USE"
     # Who subscribes now gets no number.
     late = peer.listen(TransformStamped, "extrinsic")
     late_with_covariance = peer.listen(
@@ -101,13 +97,8 @@ def test_a_contradicted_prior_withdraws_the_result_until_it_is_removed(
     late_states = peer.listen(String, "progress")
     peer.spin_until(lambda: late_states, "what is latched")
     saved = peer.trigger("save")
-    assert (
-        saved.success,
-        ": DO NOT USE: the prior on z is " in saved.message,
-    ) == (
-        True,
-        True,
-    )
+    assert saved.success
+    assert ": DO NOT USE: the prior on z is " in saved.message
     assert load_result(directory).verdict is Verdict.DO_NOT_USE
     kept = peer.trigger("reset").message
     assert kept.startswith("all poses discarded, new session; prior.z ")

@@ -59,6 +59,23 @@ def calibration():
     return calibrator.estimate()
 
 
+def edges(transforms):
+    """Transforms of the camera among those received."""
+    return [
+        transform
+        for transform in transforms
+        if transform.child_frame_id == "camera"
+    ]
+
+
+def fault_in(statuses):
+    """Text of the newest progress if the streams have a fault, otherwise empty."""
+    newest = statuses.get("/calibrator: progress")
+    if newest is None or values_of(newest)["is_faulty"] != "true":
+        return ""
+    return newest.message
+
+
 class TestNode:
     """On the real topics, wherever tf2_msgs is installed."""
 
@@ -108,22 +125,11 @@ class TestNode:
             *RELIABLE_INPUTS,
         )  # fmt: skip
 
-        def edges(transforms):
-            return [
-                transform
-                for transform in transforms
-                if transform.child_frame_id == "camera"
-            ]
-
         def state(name="extrinsic", key="tf_static"):
             return values_of(statuses[f"/calibrator: {name}"])[key]
 
         def fault():
-            newest = statuses.get("/calibrator: progress")
-            is_faulty = (
-                newest is not None and values_of(newest)["is_faulty"] == "true"
-            )
-            return newest.message if is_faulty else ""
+            return fault_in(statuses)
 
         publishers = peer.publishers()
         poses = drive(500)
@@ -144,22 +150,18 @@ class TestNode:
         assert pytest.approx(matrix(extrinsics[-1])) == T
         # The answer, the file and the page say the same, and of the same poses.
         answer = peer.trigger("solve").message
-        assert (
-            f"xyz = ({', '.join(f'{value:.4f}' for value in T[:3, 3])})"
-            in answer
-        )
+        xyz = ", ".join(f"{value:.4f}" for value in T[:3, 3])
+        assert f"xyz = ({xyz})" in answer
         assert peer.trigger("save").success
         saved = load_result(tmp_path)
         assert saved.T_parent_child == pytest.approx(T)
         assert f"{saved.n_poses} poses" in answer
         document = json.loads(states[-1].data)
-        assert [
-            document["extrinsic"]["result"]["pose"][axis] for axis in "xyz"
-        ] == pytest.approx(T[:3, 3].tolist())
-        assert (document["progress"]["progress"]["done"], saved.goal.done) == (
-            True,
-            True,
-        )
+        pose = document["extrinsic"]["result"]["pose"]
+        place = [pose[axis] for axis in "xyz"]
+        assert place == pytest.approx(T[:3, 3].tolist())
+        assert document["progress"]["progress"]["done"]
+        assert saved.goal.done
         assert peer.trigger("reset").success
         late = listen()
         peer.spin_until(lambda: late, "the robot's edge")
