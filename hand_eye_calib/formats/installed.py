@@ -46,6 +46,33 @@ _EXPECTED = (
 )
 
 
+def _typed_pose(text: str) -> FloatArray:
+    """Return the pose (4, 4) from a text of six numbers.
+
+    Raises
+    ------
+    ConfigError
+        If the text is anything else; it is then taken for a file that does not exist.
+    """
+    try:
+        values = parse_pose("installed", text)
+    except ConfigError:
+        words = text.split()
+        if len(words) == len(AXES):
+            raise
+        are_numbers = all(re.fullmatch(r"-?[\d.]+", word) for word in words)
+        if len(words) > 1 and are_numbers:
+            raise ConfigError(
+                f"installed: {len(words)} numbers; X Y Z ROLL PITCH YAW are {len(AXES)}"
+            ) from None
+        raise ConfigError(
+            f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
+            "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"
+        ) from None
+    rotation = se3.rotation_from_rpy(values[3:])
+    return se3.from_rotation_translation(rotation, values[:3])
+
+
 def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     """Read the source of an installed extrinsic before the frames of the sensors are known.
 
@@ -71,24 +98,7 @@ def open_installed(text: str) -> Callable[[str, str], Extrinsic]:
     """
     path = local_path(text)
     if not os.path.exists(path):
-        try:
-            values = parse_pose("installed", text)
-        except ConfigError:
-            words = text.split()
-            if len(words) == len(AXES):
-                raise
-            are_numbers = all(re.fullmatch(r"-?[\d.]+", word) for word in words)
-            if len(words) > 1 and are_numbers:
-                raise ConfigError(
-                    f"installed: {len(words)} numbers; X Y Z ROLL PITCH YAW are {len(AXES)}"
-                ) from None
-            raise ConfigError(
-                f"installed: no file {shown_value(text)}{similar(text)}; expected a URDF, "
-                "extrinsic.yaml, a bag, or X Y Z ROLL PITCH YAW in m and rad"
-            ) from None
-        T = se3.from_rotation_translation(
-            se3.rotation_from_rpy(values[3:]), values[:3]
-        )
+        T = _typed_pose(text)
         return lambda parent_frame, child_frame: Extrinsic(T, text)
     if (path / FILE_NAME).exists():
         path = path / FILE_NAME

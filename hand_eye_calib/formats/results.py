@@ -307,6 +307,25 @@ def _bag_instead(path: Path) -> InputError:
     )
 
 
+def _result_in(folder: Path) -> Path:
+    """Return the file of the result in a folder; raise an InputError if there is none."""
+    path = folder / FILE_NAME
+    if path.exists():
+        return path
+    if (folder / RIG_NAME).exists():
+        sensors = sorted(
+            str(file.parent) for file in folder.glob(f"*/{FILE_NAME}")
+        )
+        raise InputError(
+            f"{folder} is of a rig; name one of its sensors: {', '.join(sensors)}"
+        )
+    if any(map(has_suffix_of_bag, folder.iterdir())):
+        raise _bag_instead(folder)
+    raise InputError(
+        f"{folder} has no {FILE_NAME}: name the folder of a result (--out)"
+    )
+
+
 def load_result(path: str | Path) -> Calibration:
     """Read a calibration that :func:`save_result` wrote: the file, or its directory.
 
@@ -323,20 +342,7 @@ def load_result(path: str | Path) -> Calibration:
     """
     path = path_of("path", path)
     if path.is_dir():
-        if (path / RIG_NAME).exists() and not (path / FILE_NAME).exists():
-            sensors = sorted(
-                str(file.parent) for file in path.glob(f"*/{FILE_NAME}")
-            )
-            raise InputError(
-                f"{path} is of a rig; name one of its sensors: {', '.join(sensors)}"
-            )
-        if not (path / FILE_NAME).exists():
-            if any(map(has_suffix_of_bag, path.iterdir())):
-                raise _bag_instead(path)
-            raise InputError(
-                f"{path} has no {FILE_NAME}: name the folder of a result (--out)"
-            )
-        path = path / FILE_NAME
+        path = _result_in(path)
     elif has_suffix_of_bag(path) and path.exists():
         raise _bag_instead(path)
     if path.suffix in (".urdf", ".xacro"):

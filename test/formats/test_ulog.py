@@ -12,13 +12,9 @@ from scipy.spatial.transform import Rotation
 from hand_eye_calib.core.base.errors import InputError, MissingDependencyError
 from hand_eye_calib.formats.trajectory_files.file_options import AUTO
 
-N = 40
-
 TRUTH = as_trajectory(
-    wandering_poses(N), rate_hz=10.0, start_ns=1_700_000_000_000_000_000
+    wandering_poses(40), rate_hz=10.0, start_ns=1_700_000_000_000_000_000
 )
-
-P = TRUTH.poses[:, :3, 3]
 
 # Fields of the topics of a log of PX4, as its own definitions of messages have them.
 PX4 = {
@@ -37,7 +33,7 @@ def of_ulog(*topics):
         return struct.pack("<HB", len(data), ord(kind)) + data
 
     flip = np.diag([1.0, -1, -1])
-    places = P @ flip
+    places = TRUTH.poses[:, :3, 3] @ flip
     turns = Rotation.from_matrix(flip @ TRUTH.poses[:, :3, :3] @ flip).as_quat()
     log = (
         b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + message("B", bytes(40))

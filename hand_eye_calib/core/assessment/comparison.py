@@ -65,6 +65,23 @@ def compare(
     >>> hec.compare([result], installed=result).verdict
     'same'
     """
+    _require_types(results, installed)
+    results = [_in_frames_of(results[0], result) for result in results]
+    if isinstance(installed, Calibration) and results:
+        installed = _in_frames_of(results[0], installed)
+    by_name = _by_name(results, names)
+    require_same_frames(
+        extrinsic
+        for extrinsic in (*results, installed)
+        if isinstance(extrinsic, Calibration)
+    )
+    if installed is not None:
+        return _comparison_with_installed(by_name, installed)
+    return _comparison_with_each_other(by_name)
+
+
+def _require_types(results: Sequence[object], installed: object) -> None:
+    """Raise an InputError if an argument of :func:`compare` has another type."""
     require_type("results", results, Sequence, remedy="pass a list of results")
     for result in results:
         require_type(
@@ -81,18 +98,6 @@ def compare(
             f"{type(installed).__name__}. For another source, run hand_eye_calib compare DIR "
             "--with SOURCE"
         )
-    results = [_in_frames_of(results[0], result) for result in results]
-    if isinstance(installed, Calibration) and results:
-        installed = _in_frames_of(results[0], installed)
-    by_name = _by_name(results, names)
-    require_same_frames(
-        extrinsic
-        for extrinsic in (*results, installed)
-        if isinstance(extrinsic, Calibration)
-    )
-    if installed is not None:
-        return _comparison_with_installed(by_name, installed)
-    return _comparison_with_each_other(by_name)
 
 
 def _in_frames_of(first: Calibration, result: Calibration) -> Calibration:

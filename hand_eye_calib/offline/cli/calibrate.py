@@ -8,8 +8,9 @@ same for bags and journals only.
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import (
@@ -139,6 +140,23 @@ def _add_installed(parser: argparse.ArgumentParser) -> None:
     add("--base-frame", metavar="FRAME", help=base_frame)
 
 
+def _matching_paths(patterns: Sequence[Any]) -> list[Any]:
+    """Return the paths that match patterns with ``*``."""
+    from hand_eye_calib.formats.bags.patterns import matching
+
+    return [
+        type(pattern)(match)
+        for pattern in patterns
+        for match in matching(str(pattern))
+    ]
+
+
+def _refuse_repeated_labels(labels: Sequence[str]) -> None:
+    for name in labels:
+        if labels.count(name) > 1:
+            raise ConfigError(f"--label {name} was given twice; keep one")
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate, and return the exit code."""
     is_batch = bool(getattr(arguments, "batch", None))
@@ -147,19 +165,10 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     if is_batch and (arguments.paths or arguments.list):
         raise ConfigError("--batch cannot be combined with PATH or --list")
-    labels = [name for name, _ in arguments.label]
-    for name in labels:
-        if labels.count(name) > 1:
-            raise ConfigError(f"--label {name} was given twice; keep one")
+    _refuse_repeated_labels([name for name, _ in arguments.label])
     # The shell does not expand a pattern in quotes, or in a URL.
     if any("*" in str(path) for path in arguments.paths):
-        from hand_eye_calib.formats.bags.patterns import matching
-
-        arguments.paths = [
-            type(path)(match)
-            for path in arguments.paths
-            for match in matching(str(path))
-        ]
+        arguments.paths = _matching_paths(arguments.paths)
     if not any("://" in str(path) for path in arguments.paths):
         return _run_locally(arguments, lambda value: value)
     from hand_eye_calib.formats.remote import local_copies

@@ -171,6 +171,17 @@ class _ShowHelp(argparse.Action):
         parser.exit()
 
 
+def _unknown_command(word: str, argv: Sequence[str]) -> str:
+    """Return the message about a first word that is no command."""
+    if word == "help":
+        return "write hand_eye_calib COMMAND --help"
+    if line := calibrating(argv):
+        return f"{word!r} is a path; a command comes first: {line}"
+    known = ", ".join(COMMANDS)
+    hint = did_you_mean(word, COMMANDS)
+    return f"invalid choice: {word!r}, expected one of {known}{hint}"
+
+
 def _run(argv: Sequence[str]) -> int:
     """Parse the arguments, and run the command."""
     command = next((word for word in argv if not word.startswith("-")), None)
@@ -184,14 +195,7 @@ def _run(argv: Sequence[str]) -> int:
         "--version", action="store_true", help="show the version and exit"
     )
     if command is not None and command not in COMMANDS:
-        known = f"expected one of {', '.join(COMMANDS)}{did_you_mean(command, COMMANDS)}"
-        if command == "help":
-            parser.error("write hand_eye_calib COMMAND --help")
-        if line := calibrating(argv):
-            parser.error(
-                f"{command!r} is a path; a command comes first: {line}"
-            )
-        parser.error(f"invalid choice: {command!r}, {known}")
+        parser.error(_unknown_command(command, argv))
     parsers = _add_commands(parser)
     if command is not None:
         module = COMMANDS[command].load()
