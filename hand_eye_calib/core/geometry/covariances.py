@@ -13,15 +13,16 @@ from hand_eye_calib.core.geometry.se3 import (
     rotation_to_rpy,
 )
 
-# Largest standard deviation (rad) of a known angle. Above it, the linearisation is not valid.
+# Largest standard deviation (rad) of an angle that counts as known. The linearisation is invalid
+# above it.
 _MAX_SIGMA_RAD = 0.3
 
-# Gimbal lock: roll and yaw are unknown if the cosine of the pitch is below this number of standard
+# In gimbal lock, roll and yaw are unknown: the cosine of the pitch is below this number of standard
 # deviations (rad) of the rotation. The standard deviations of roll and yaw would exceed 10 deg, and
 # their errors would not be normal.
 _LOCKED_SIGMAS = 5.0
 
-# Gimbal lock for exact rotations: smallest cosine of the pitch with known roll and yaw.
+# Smallest cosine of the pitch at which exact rotations have known roll and yaw.
 _LOCKED_COSINE = 1e-4
 
 
@@ -30,8 +31,8 @@ def turned(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
 
     If R is the rotation of ``T_parent_child``, the result is along and about the parent's axes, the
     convention of ROS messages (REP 103). To first order, an error xi in ``T_parent_child @
-    exp(xi)`` moves the child's origin by ``R rho`` and rotates the child by ``R phi`` about its own
-    origin. So the lever arm between both sensors has no effect.
+    exp(xi)`` moves the origin of the child by ``R rho``, and rotates the child by ``R phi`` about
+    this origin. Therefore the lever arm between the sensors has no effect.
     """
     both = block_diagonal(rotation)
     return both @ covariance @ np.swapaxes(both, -1, -2)
@@ -42,7 +43,7 @@ def sigmas_in_parent(
 ) -> FloatArray:
     """Return standard deviations (6,), m and rad, along and about the parent's axes.
 
-    All are infinite if the covariance (6, 6) of xi in the child's frame is not finite.
+    If the covariance (6, 6) of xi in the child's frame is not finite, all values are infinite.
     """
     if not np.isfinite(covariance).all():
         return np.full(6, np.inf)
@@ -99,8 +100,8 @@ def inverse_covariance(
 ) -> FloatArray:
     """Return the covariance (6, 6) of the inverse of a transform T with covariance C (6, 6) of xi.
 
-    ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``. All
-    elements are infinite if C is not finite.
+    ``inverse(T exp(xi)) = inverse(T) exp(-Ad_T xi)``, so the covariance is ``Ad_T C Ad_T'``. If C
+    is not finite, all elements are infinite.
     """
     covariance = np.asarray(covariance, dtype=float)
     if not np.isfinite(covariance).all():

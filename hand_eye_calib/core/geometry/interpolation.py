@@ -14,16 +14,17 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 
-# Motion and noise are distinguished by this number of intervals on either side of an interval.
+# Motion and noise are distinguished by this number of intervals on each side of an interval.
 _NEARBY = 4
 
-# Number of poses before and after a stamp that interpolation uses.
+# Number of poses on each side of a stamp that interpolation uses.
 REACH = _NEARBY + 2
 
 # Correlation of neighbouring second differences of white noise: -4 s^2 / (6 s^2).
 _CORRELATION = -2.0 / 3.0
 
-# Variance of the mean of two neighbouring second differences of white noise, over that of one.
+# Variance of the mean of two neighbouring second differences of white noise, divided by the
+# variance of one.
 _VARIANCE_OF_MEAN = 1.0 / 6.0
 
 
@@ -65,15 +66,15 @@ def corner_corrections(
 ) -> FloatArray:
     """Return the corrections of poses that were interpolated with a constant twist.
 
-    A constant twist between two poses cuts the corners of a motion. The amplitude of a vibration of
-    angular frequency f, sampled every h seconds, decreases by the share (f h)^2 / 12. The changes
-    of the twist at both poses correct this loss, if they are motion and not noise.
+    A constant twist between two poses cuts the corners of a motion. If a vibration of angular
+    frequency f is sampled every h seconds, its amplitude decreases by the share (f h)^2 / 12. The
+    changes of the twist at both poses correct this loss, as far as they are motion and not noise.
 
-    White noise of poses with standard deviation s causes changes of variance 6 s^2, with a
-    covariance of -4 s^2 between neighbours, in units of h. A well sampled motion causes equal
-    changes at neighbours. So the share of motion is estimated from the correlation of neighbouring
-    changes. Halfway between two poses, the standard deviation of white noise is 0.71 (constant
-    twist) to 0.80 of its value at a pose.
+    White noise of poses with standard deviation s causes changes with variance 6 s^2, and
+    covariance -4 s^2 between neighbours, in units of h. A well sampled motion causes equal changes
+    at neighbours. Therefore the correlation of neighbouring changes determines the share of motion.
+    Halfway between two poses, the standard deviation of white noise is 0.71 (constant twist) to
+    0.80 of its value at a pose.
 
     Parameters
     ----------

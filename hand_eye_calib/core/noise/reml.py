@@ -218,8 +218,8 @@ def _group_gradient(
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
     n_poses, n_processes, _ = values.shape
-    # Second moments at each pose (N,), and between each pose and the pose before (n,), summed
-    # over the processes of the group.
+    # Second moments, summed over the processes of the group: at each pose (N,), and between each
+    # pose and the previous pose (n,).
     squares = np.einsum("nii->n", covariance[:, group.states, group.states])
     squares += np.einsum("nij,nij->n", values, values)
     products = np.einsum("nii->n", below[:, group.states, group.states])
