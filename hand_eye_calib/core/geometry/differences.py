@@ -1,7 +1,7 @@
 """Velocities, angular rates and their derivatives from differences between samples.
 
-A difference does not use the sample itself, only samples one and two steps before and after. So
-the white noise of a sample is independent of the derivatives at this sample.
+A difference uses the samples one and two steps before and after a sample, but not the sample
+itself. So the white noise of a sample is independent of the derivatives at this sample.
 """
 
 from typing import NamedTuple
@@ -65,8 +65,8 @@ def rotations_around(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return rotation vectors (N, 3) around each of N orientations (N, 3, 3).
 
-    They are the rotation over the two middle steps, over the first step and over the last step, in
-    the axes at the start of each rotation.
+    The three vectors are the rotations over the two middle steps, over the first step and over the
+    last step, in the axes at the start of each rotation.
     """
     before_2, before, after, after_2, _ = around
     return (

@@ -24,7 +24,7 @@ from hand_eye_calib.core.geometry.trajectory import (
     far_position,
 )
 
-# Largest difference between an element of a rotation matrix and that of the nearest rotation.
+# Largest difference between an element of a rotation matrix and the nearest rotation.
 _ROTATION_WITHIN = 1e-2
 
 # Last row of every transform.
@@ -70,7 +70,7 @@ def are_null(poses: FloatArray) -> BoolArray:
     poses when they are lost.
     """
     is_null = (poses[:, 3:] == 0.0).all(axis=1)
-    # If the sum is finite, all values are. The sum takes less time than a check of every row.
+    # If the sum is finite, all values are finite. The sum is faster than a check of every row.
     with np.errstate(invalid="ignore", over="ignore"):
         total = poses.sum()
     if not np.isfinite(total):
@@ -92,7 +92,7 @@ def check_pose(*values: float) -> None:
     Raises
     ------
     NoPoseError
-        If the source states that there is no pose, see :func:`are_null`.
+        If the source has no pose at this instant, see :func:`are_null`.
     InputError
         If the quaternion is not of unit length, or the position is too far away.
     """
@@ -127,7 +127,7 @@ def pose_of(*values: Any) -> FloatArray:
     Raises
     ------
     InputError
-        If the values have another form, or are no rigid transform.
+        If the values have another form, or are not a rigid transform.
     """
     parts = [numbers_of(value) for value in values]
     sizes = tuple(map(len, parts))
@@ -227,7 +227,7 @@ def _numbers(values: Any) -> FloatArray | None:
 
 
 def _pair_of_stacks(values: Any) -> tuple[FloatArray, FloatArray] | None:
-    """Return rotations and translations if the values are a pair of both, otherwise None."""
+    """Return rotations and translations if the values are a pair of them, otherwise None."""
     if not isinstance(values, tuple | list) or len(values) != 2:
         return None
     rotations, translations = map(_numbers, values)
@@ -296,7 +296,7 @@ def wrong_last_row(T: FloatArray) -> str:
 def numbers_of(value: Any) -> list[float]:
     """Return the numbers in nested lists, in a message, in a matrix of OpenCV or in a text.
 
-    The numbers are in their order; the list is empty for values of any other kind.
+    The numbers keep their order. The list is empty for other kinds of values.
     """
     if isinstance(value, Mapping):
         position = value.get("translation", value.get("position"))
@@ -351,9 +351,9 @@ class StreamFrames:
     def inverse_name(self) -> str:
         """Name of the sensor's frame if the poses of the stream are inverted.
 
-        For transforms camera -> marker of a fixed marker, the frames exchange their roles, so that
-        the sensor is the camera. For inverse poses odom -> base_link, the sensor remains base_link,
-        because odom is the name of a world.
+        If the transforms camera -> marker are of a fixed marker, both frames exchange their roles,
+        and the sensor is the camera. For inverse poses odom -> base_link, the sensor remains
+        base_link, because odom is the name of a world.
         """
         is_named_otherwise = self.option not in ("", self.sensor)
         if not self.world or is_named_otherwise:
@@ -428,7 +428,7 @@ class FrameTree:
         pose: FloatArray | None = None,
         is_static: bool = True,
     ) -> Edge:
-        """Add an edge, or replace its pose. An edge that has moved once is never static again.
+        """Add an edge, or replace its pose. An edge that has moved never becomes static again.
 
         Raises
         ------
@@ -484,7 +484,8 @@ class FrameTree:
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
         """Return the edges on the path from ``frame`` to ``of``, by the frames below them.
 
-        The first list are the edges up to the common frame, the second the edges down from there.
+        The first list has the edges up to the common frame, and the second list the edges down from
+        it.
 
         Raises
         ------
@@ -502,7 +503,7 @@ class FrameTree:
         return up, down[::-1]
 
     def above(self, frame: str) -> list[str]:
-        """Return the frame, its parent, the parent of its parent, and so on to the root.
+        """Return a frame, its parent, the parent of its parent, and so on to the root.
 
         Raises
         ------

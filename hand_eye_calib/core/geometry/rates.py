@@ -12,14 +12,14 @@ from hand_eye_calib.core.geometry import se3
 
 
 class RateIntegrator:
-    """Integrator of the angular rates of one sensor, which come in blocks of any length."""
+    """Integrate the angular rates of one sensor, which arrive in blocks of any length."""
 
     def __init__(self) -> None:
         self._last: tuple[IntArray, FloatArray] | None = None
         self._rotation = np.eye(3)
 
     def rotations(self, stamps_ns: IntArray, rates: FloatArray) -> FloatArray:
-        """Integrate further rates; return orientations relative to that at the very first rate.
+        """Integrate further rates. Return orientations relative to that at the first rate.
 
         If the stamps go back in time, the sensor rotates back.
 
@@ -44,6 +44,6 @@ class RateIntegrator:
         steps = se3.rotation_exp(means * intervals_s[:, None])
         rotations = self._rotation @ se3.chained(steps)[1:]
         self._last = stamps_ns[-1:].copy(), rates[-1:].copy()
-        # Rounding errors add up over hours, so the last orientation is made an exact rotation.
+        # Rounding errors add up over hours. Make the last orientation an exact rotation.
         self._rotation = se3.nearest_rotation(rotations[-1])
         return rotations

@@ -1,9 +1,9 @@
 """Batched rigid transforms.
 
 Transforms are ``(..., 4, 4)`` arrays named ``T_target_source``: they map coordinates of ``source``
-into ``target``. Tangent vectors are ``(..., 6)`` arrays ``(rho, phi)``, translation (m) before
-rotation (rad), acting on the right: ``T_target_source @ exp(xi_in_source)``. Rotation conversions
-are written out because SciPy's take a tenth of a second to import.
+into ``target``. Tangent vectors are ``(..., 6)`` arrays ``(rho, phi)``: translation (m) before
+rotation (rad). They act on the right: ``T_target_source @ exp(xi_in_source)``. This module has its
+own conversions of rotations, because the import of SciPy's takes a tenth of a second.
 """
 
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from hand_eye_calib.core.base.arrays import FloatArray
 
-# Angle (rad) below which Taylor series replace the closed forms of exp and log, which lose digits
-# by cancellation there. At this angle, the first omitted term is about 1e-16 of the sum.
+# Below this angle (rad), Taylor series replace the closed forms of exp and log, which lose digits
+# by cancellation. At this angle, the first omitted term is about 1e-16 of the sum.
 _SERIES_ANGLE = 1e-2
 
-# Cosine of the pitch below which roll and yaw are rotations about the same axis, up to rounding.
+# If the cosine of the pitch is smaller than this, roll and yaw are about the same axis up to
+# rounding.
 _SINGULAR_COSINE = 1e-7
 
 
@@ -141,8 +142,8 @@ def _about_axes(angles: FloatArray) -> list[FloatArray]:
 def rotation_to_rpy(rotation: ArrayLike) -> FloatArray:
     """Return roll, pitch and yaw (..., 3), rad: the inverse of :func:`rotation_from_rpy`.
 
-    The pitch is from -pi/2 to pi/2. At these two values, only the sum or the difference of roll and
-    yaw is defined; the yaw is set to 0.
+    The pitch is between -pi/2 and pi/2. At both ends, only the sum or the difference of roll and
+    yaw is defined, and yaw is set to 0.
     """
     R = np.asarray(rotation, dtype=float)
     cosine = np.hypot(R[..., 0, 0], R[..., 1, 0])
@@ -169,9 +170,9 @@ def in_other_order(rotations: FloatArray) -> FloatArray:
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Return the rotations (..., 3, 3) nearest to matrices in the Frobenius norm.
 
-    The singular vector of the smallest singular value gets the sign that makes the determinant 1.
-    Motion in a plane does not determine this sign (S. Umeyama, *Least-squares estimation of
-    transformation parameters between two point patterns*, 1991).
+    The sign of the smallest singular vector is chosen so that the determinant is 1. Motion in a
+    plane does not determine this sign (S. Umeyama, *Least-squares estimation of transformation
+    parameters between two point patterns*, 1991).
     """
     U, _, V_transposed = np.linalg.svd(matrices)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ V_transposed))[..., None]
@@ -219,8 +220,8 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
-    # If the trace is not negative, the scalar is large enough. Otherwise, the computation starts
-    # from the largest coefficient i of the vector.
+    # A trace that is not negative means that the scalar is large enough. Otherwise, start from the
+    # largest coefficient i of the vector part.
     large = np.flatnonzero(trace < 0.0)
     if large.size:
         R = rotations[large]
@@ -378,8 +379,8 @@ def times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
 def adjoint(transforms: ArrayLike) -> FloatArray:
     """Return the adjoint matrices (..., 6, 6) of transforms (..., 4, 4).
 
-    They map a tangent vector (rho, phi) from the source frame to the target frame:
-    ``T @ exp(xi) == exp(adjoint(T) @ xi) @ T``.
+    An adjoint maps a tangent vector (rho, phi) from the source frame to the target frame: ``T @
+    exp(xi) == exp(adjoint(T) @ xi) @ T``.
     """
     transforms = np.asarray(transforms, dtype=float)
     rotation = rotation_of(transforms)
@@ -428,7 +429,7 @@ def chained(steps: FloatArray) -> FloatArray:
     The steps are rotations or transforms.
     """
     products = np.concatenate([np.eye(steps.shape[-1])[None], steps])
-    # Each pass doubles the number of steps in the products, until all products are complete.
+    # Each pass doubles the number of steps in a product, until all products are complete.
     span = 1
     while span < len(products):
         products[span:] = products[:-span] @ products[span:]
@@ -445,7 +446,8 @@ def put_right(
     ----------
     Ts : (N, 4, 4) array
     invert : {"none", "poses", "orientations"}
-        Part that is inverted, because the source states the world's pose in the sensor's frame.
+        Part that is inverted, because the source contains the pose of the world in the sensor's
+        frame.
     quaternion : {"xyzw", "wxyz", "yzwx"}
         True order of the four numbers that were read as x y z w.
 

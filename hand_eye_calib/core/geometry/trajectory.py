@@ -1,4 +1,4 @@
-"""Trajectories: stamped poses of one sensor in a fixed frame of its own."""
+"""Trajectories: stamped poses of one sensor in its own fixed frame."""
 
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -24,31 +24,30 @@ from hand_eye_calib.core.geometry.interpolation import (
     shares_of_motion,
 )
 
-# Largest deviation of the length of a quaternion from 1. A larger one is not due to rounding (limit
-# of tf2).
+# Largest deviation of the length of a quaternion from 1 that may be rounding (limit of tf2).
 QUATERNION_NORM_TOLERANCE = 1e-2
 
-# Largest coordinate of a position (m). Distances from the Earth's centre in millimetres, about
-# 6.4e9, are still accepted.
+# Largest coordinate of a position (m). It still accepts distances from the Earth's centre in
+# millimetres, about 6.4e9.
 FARTHEST_M = 1e10
 
-# Distance of places on the earth from its centre (m): every position on the ground is farther ...
+# A position on the ground is farther from the centre of the earth than this (m) ...
 _MIN_EARTH_M = 6.3e6
-# ... and every position of an aircraft is nearer.
+# ... and a position of an aircraft is nearer than this (m).
 _MAX_EARTH_M = 6.45e6
 
-# Largest element of R'R - I for a rotation matrix R. A matrix with six digits passes, a scaled one
-# fails.
+# Largest element of R'R - I for a rotation matrix R. A matrix with six digits passes; a scaled
+# matrix fails.
 ROTATION_TOLERANCE = 1e-3
 
-# A direction of motion is that of a step of the extent of all positions over this number. At least
-# a fifth of this number of steps is needed.
+# Directions of motion are those of steps whose length is the extent of all positions divided by
+# this number. At least a fifth of this number of steps is needed.
 _STEPS_IN_EXTENT = 50
 
-# A convention is wrong if its scatter of the direction of motion exceeds this value, see
+# A convention is wrong if the scatter of its direction of motion exceeds this value, see
 # :func:`scatter_of_direction` ...
 STEADY_SCATTER = 0.05
-# ... and if it exceeds this multiple of the scatter in another convention.
+# ... and also this multiple of the scatter in another convention.
 WRONG_SCATTER_RATIO = 4.0
 
 
@@ -56,7 +55,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     """Return the scatter of the direction of motion of poses (N, 4, 4) in the sensor's axes.
 
     The scatter is 1 minus the length of the mean direction. It is 0 if the direction never changes,
-    as on vehicles, and 1 if the sensor moves in all directions, or if there are too few steps.
+    as on vehicles. It is 1 if the sensor moves in all directions, or if there are too few steps.
     """
     positions = se3.translation_of(poses)
     rotations = se3.rotation_of(poses)
@@ -69,7 +68,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     rows = np.flatnonzero(np.diff(n_steps_before, prepend=-1.0))
     steps = np.diff(positions[rows], axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    # During standstill, noise of the positions adds up to a path without a direction.
+    # At rest, noise of the positions adds up to a path without a direction.
     is_step = lengths > step_m / 3
     if is_step.sum() < _STEPS_IN_EXTENT / 5:
         return 1.0
@@ -80,7 +79,7 @@ def scatter_of_direction(poses: FloatArray) -> float:
     return 1.0 - float(np.linalg.norm(in_sensor.mean(axis=0)))
 
 
-#: Poses, positions or angles that differ by less than this (m, rad) are equal to rounding.
+#: Poses, positions or angles that differ by less than this (m, rad) are equal up to rounding.
 SAME_POSE = 1e-6
 
 # Smallest and largest stamp, ns.
@@ -91,7 +90,7 @@ _STAMPS_NS = np.iinfo(np.int64)
 class WithArrays:
     """Base of dataclasses with arrays: two are equal if all their fields are equal.
 
-    Subclasses are declared with ``eq=False``.
+    Declare subclasses with ``eq=False``.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -115,7 +114,8 @@ class Columns(WithArrays):
     """Base of dataclasses with arrays of equally many rows; the first field is an array."""
 
     def __len__(self) -> int:
-        # The name of the first field: a tuple of all columns takes longer, and loops ask often.
+        # Use the name of the first field. A tuple of all columns is slower, and loops need this
+        # often.
         first = next(iter(self.__dataclass_fields__))
         return len(getattr(self, first))
 
@@ -150,8 +150,8 @@ class Trajectory(Columns):
     world_frame : str
         Name of the fixed frame; empty if unknown.
     measures : {"poses", "positions", "rotations", "rates"}
-        Measured part of the poses. The orientations of positions and the positions of rotations are
-        meaningless. Rates are stored as integrated rotations, with a bias.
+        Measured part of the poses. Positions have no valid orientations, and rotations no valid
+        positions. Rates are stored as integrated rotations, with a bias.
 
     Raises
     ------
@@ -171,7 +171,8 @@ class Trajectory(Columns):
     world_frame: str = ""
     measures: str = "poses"
 
-    # Trajectory whose stamps were shifted to make this one. Both have the same `_steps`.
+    # Trajectory with the original stamps, if the stamps of this one were shifted. Both have the
+    # same `_steps`.
     _unshifted: ClassVar[Self | None] = None
 
     def __hash__(self) -> int:
@@ -322,7 +323,7 @@ class Trajectory(Columns):
         offset_s : float
             Seconds that are added to every stamp.
         rate : float
-            Further seconds that are added for each second after ``about_ns``.
+            Number of seconds that are also added for each second after ``about_ns``.
         about_ns : int
             Stamp (ns) at which ``rate`` adds nothing.
 
@@ -357,7 +358,7 @@ class Trajectory(Columns):
             return self
         poses = self.poses.copy()
         poses[:, :3, 3] *= scale
-        # Positions are not checked, because in another unit they may exceed the largest position.
+        # Positions in another unit may exceed the largest position, so they are not checked.
         return self._unchecked("poses", poses)
 
     def _unchecked(

@@ -16,17 +16,17 @@ from hand_eye_calib.core.base.text import parse_reference
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 
-# Ratio of the median intervals of both streams up to which they are equally fast. Pose pairs have
-# the child's stamps then.
+# Both streams count as equally fast if the ratio of their median intervals is at most this. The
+# pose pairs then have the child's stamps.
 _MAX_EQUAL_RATIO = 1.2
 
-# Number of poses that are searched at once for the next keyframe.
+# Number of poses that are searched together for the next keyframe.
 _WINDOW = 64
 
-# Longest plausible pause of a recording (s): one day. A longer pause means wrong stamps.
+# Longest plausible pause of a recording (s): one day. If a pause is longer, the stamps are wrong.
 _MAX_PAUSE_S = 86_400.0
 
-# Largest number of motion pairs of a fit, unless its caller asks for more.
+# Largest number of motion pairs in a fit, unless the caller sets another number.
 MAX_PAIRS = 800
 
 
@@ -160,10 +160,10 @@ def select_keyframes(
 ) -> IntArray:
     """Return the indices of keyframes among pose pairs, ascending.
 
-    A pose pair is a keyframe if ``min_interval_s`` has passed since the last keyframe, and if the
-    parent sensor has moved by ``min_translation`` or rotated by ``min_rotation`` since then. A
-    threshold of zero disables its criterion. The first pose pair is a keyframe unless there is a
-    previous one.
+    A pose pair is a keyframe if two conditions are met since the last keyframe: ``min_interval_s``
+    has passed, and the parent sensor has moved by ``min_translation`` or rotated by
+    ``min_rotation``. A threshold of zero disables its criterion. Without a previous keyframe, the
+    first pose pair is a keyframe.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def motion_pairs(
 ) -> MotionPairs:
     """Return the relative motions of two synchronised trajectories for a reference.
 
-    The reference defines between which poses the motions are.
+    The reference selects the two poses of each motion.
 
     Parameters
     ----------
@@ -329,7 +329,7 @@ def pairs_between(
 def motions(start: FloatArray, end: FloatArray) -> FloatArray:
     """Return the motions ``inv(start) @ end`` of a sensor between poses (..., 4, 4).
 
-    The positions are subtracted before the rotation. For map coordinates of 1e6 m, an inversion of
+    Positions are subtracted before they are rotated. For map coordinates of 1e6 m, an inversion of
     the start would lose ten digits.
     """
     motion = end.copy()
@@ -345,13 +345,13 @@ def pairs_over(
 ) -> MotionPairs:
     """Return motion pairs that last about ``lag_s`` seconds, spread evenly over the recording.
 
-    Motions that last more than half longer, because of a gap, are skipped.
+    Motions that a gap makes longer by more than half are skipped.
 
     Parameters
     ----------
     pose_pairs : PosePairs
     lag_s : float
-        Duration (s) of the motions; the median interval of the pose pairs if that is longer.
+        Duration (s) of the motions. If the median interval of the pose pairs is longer, it is used.
     max_pairs : int
         Largest number of motion pairs.
     """
@@ -366,8 +366,7 @@ def pairs_over(
     has_end = after < n_poses
     i = i[has_end]
     after = after[has_end]
-    # Use the pose nearest to the end. The first pose after the end would more often have a late
-    # stamp.
+    # Use the pose nearest to the end. The first pose after the end would often have a late stamp.
     ends_ns = stamps_ns[i] + lag_ns
     is_before = ends_ns - stamps_ns[after - 1] < stamps_ns[after] - ends_ns
     j = np.maximum(after - is_before, i + 1)

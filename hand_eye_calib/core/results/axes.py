@@ -1,4 +1,4 @@
-"""The axes that the streams of a result can determine, with their sigmas and targets."""
+"""Axes that the streams of a result can determine, with their sigmas and targets."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from hand_eye_calib.core.results.result import Result
 class ReachableAxis(NamedTuple):
     """An axis that the streams can determine.
 
-    ``sigma`` is the measured standard deviation (m or rad); ``total`` contains the allowance, too.
+    ``sigma`` is the measured standard deviation (m or rad). ``total`` also contains the allowance.
     """
 
     name: str

@@ -126,7 +126,7 @@ class Calibration(Judged):
     def inverse(self) -> "Calibration":
         """Return the pose of the parent sensor in the child sensor's frame, as a result.
 
-        The result has no residuals, no cross-check and no comparison with an installed transform.
+        The inverse has no residuals, no cross-check, and no comparison with an installed transform.
         """
         T = self.T_parent_child
         covariance = inverse_covariance(T, self.covariance_measured)
@@ -170,11 +170,11 @@ class Calibration(Judged):
         )
 
     def save(self, directory: str | Path) -> Path:
-        """Write ``extrinsic.yaml`` and the files for robots; see :func:`hand_eye_calib.save`."""
+        """Write ``extrinsic.yaml`` and files for robots; see :func:`hand_eye_calib.save`."""
         return RESULT_METHODS["save"](self, directory)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the result: a figure of Matplotlib; see :func:`hand_eye_calib.plot`."""
+        """Draw the result with Matplotlib; see :func:`hand_eye_calib.plot`."""
         return RESULT_METHODS["plot"](self, ax)
 
     def _repr_html_(self) -> str:
@@ -188,8 +188,8 @@ class Calibration(Judged):
         Raises
         ------
         InputError
-            If the result was read from a file, because files have no poses.
-            If the report cannot be written.
+            If the result was read from a file, because files have no poses; or if the report cannot
+            be written.
         """
         self.residuals()
         require_type("path", path, str, PathLike)
@@ -199,9 +199,9 @@ class Calibration(Judged):
     def static_transform_command(self) -> str:
         """Return the shell command that publishes the child's pose as a static transform.
 
-        The pose is in the frame that the child is mounted on. Instead of the number of an unknown
-        axis, the command has a word that static_transform_publisher refuses. The command is empty
-        if the verdict is DO NOT USE.
+        The pose is in the frame on which the child is mounted. If an axis is unknown, the command
+        has a word instead of a number, which static_transform_publisher refuses. The command is
+        empty if the verdict is DO NOT USE.
         """
         arguments = document.transform_arguments(self, 9)
         if not arguments:
@@ -222,16 +222,16 @@ class Calibration(Judged):
         Returns
         -------
         str
-            The text of the file, with a comment that names source and target frame of the numbers.
-            For a format with the sensors in the other order, the transform and the sign of the
-            time offset are inverted.
+            Text of the file, with a comment that names the source and the target frame of the
+            numbers. If the format has the sensors in the other order, the transform and the sign of
+            the time offset are inverted.
 
         Raises
         ------
         ConfigError
             For an unknown format.
         InputError
-            If the verdict is DO NOT USE, or if an axis that the format needs is unknown.
+            If the verdict is DO NOT USE, or an axis that the format needs is unknown.
 
         Examples
         --------
@@ -242,7 +242,7 @@ class Calibration(Judged):
     def to_dict(self) -> Document:
         """Return the result without its residuals in plain values, for JSON or YAML.
 
-        Infinite numbers and the values of unknown axes are None. Only a ``matrix`` has numbers for
+        Infinite numbers and values of unknown axes are None. Only ``matrix`` contains numbers for
         unknown axes, so that :meth:`from_dict` can read it.
         """
         return document.document_of(self)

@@ -1,6 +1,6 @@
 """Comparison of a result with the installed transform, or of two results.
 
-The classes hold plain values, as those of :mod:`hand_eye_calib.core.results.records`.
+The classes have plain values, like the classes in :mod:`hand_eye_calib.core.results.records`.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ class AxisDifference:
     sigma : float
         Standard deviation of the difference; infinite if unknown.
     visible : float
-        Smallest change that the comparison detects nine times out of ten.
+        Smallest change that the comparison detects in nine of ten cases.
     verdict : str
         "same", "moved" or "cannot tell".
     """

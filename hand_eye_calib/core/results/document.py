@@ -1,4 +1,4 @@
-"""Documents: a result as plain values for JSON and YAML, and the numbers for other programs."""
+"""Documents: a result as plain values for JSON and YAML, and its numbers for other programs."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -34,14 +34,14 @@ from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.verdict import Judged
 
 FORMAT = "hand_eye_calib/extrinsic"
-# A change that an older reader cannot understand raises the version. In version 1, covariance and
-# sigma did not contain the allowance, and the allowance was called floor.
+# Version of the documents. It increases with a change that an older reader cannot understand. In
+# version 1, covariance and sigma did not contain the allowance, which was called floor.
 VERSION = 2
 
-# Logarithm of the ratio of two standard deviations below which both are the same for a reader.
+# Two standard deviations are practically the same if their log ratio is below this.
 _SAME_ANGLES = 0.2
 
-# Share of a standard deviation below which an allowance changes none of its two digits.
+# An allowance below this share of a standard deviation changes none of its two digits.
 _NEGLIGIBLE_SHARE = 0.01
 
 # Fields of a result that are matrices in a document.
@@ -50,7 +50,8 @@ COVARIANCES = ("covariance_measured", "covariance_allowance")
 # Fields of a result that documents do not have.
 NOT_IN_FILES = ("motion_residuals", "recording", "parts")
 
-# If a direction is unobservable, an axis with a larger standard deviation (m) is unknown, too.
+# If a direction is unobservable, an axis is also unknown if its standard deviation (m) is larger
+# than this.
 UNKNOWN_M = 0.9
 
 # An axis is unknown if it contains more than this share (a cosine) of an unobservable direction.
@@ -62,9 +63,9 @@ class Notation:
     """A transform in the notations of documents: translation, quaternion, angles and matrix.
 
     ``maps`` names source and target. Each number (m, deg) has a standard deviation (``sigma``), and
-    its part without the allowance (``sigma_measured``). ``sigma_about_deg`` are the standard
-    deviations of the rotation about the axes x, y and z of the target. An unknown number is NaN,
-    and its standard deviation is infinite. An unknown rotation has no quaternion.
+    a part of it without the allowance (``sigma_measured``). ``sigma_about_deg`` has the standard
+    deviations of the rotation about the axes x, y and z of the target. An unknown number is NaN
+    with an infinite standard deviation. An unknown rotation has no quaternion.
     """
 
     maps: str
@@ -144,7 +145,7 @@ def _covariances_of(result: Result) -> Document:
 
 
 def _observability_of(result: Result) -> list[Document]:
-    """Return a row for each axis: its standard deviation, and the two parts of it."""
+    """Return a row for each axis: its standard deviation, and both parts of it."""
     rows = []
     columns = zip(
         result.observability,
@@ -166,7 +167,7 @@ class _Transform(NamedTuple):
     covariances : (2, 6, 6) array-like
         Measured part and allowance.
     sigmas_m : (3,) array or None
-        Measured standard deviations of the translation; computed from the covariance if None.
+        Measured standard deviations of the translation; None if the covariance contains them.
     is_extra : bool
         Whether the transform belongs to a part of the result.
     """
@@ -187,7 +188,7 @@ def transforms_of(result: Result) -> dict[str, Notation]:
     own = result.covariance_measured, result.covariance_allowance
     exchanged = [inverse_covariance(T, covariance) for covariance in own]
     sigmas_m = result.sigmas_measured[:3]
-    # If the streams cannot determine the rotation, both sensors have the same axes by convention.
+    # If the streams cannot determine the rotation, the sensors have the same axes by convention.
     has_same_axes = {*ROTATIONS} <= {*result.out_of_reach}
     sigmas_of_inverse_m = sigmas_m if has_same_axes else None
     transforms = {
@@ -228,7 +229,7 @@ def _notation(transform: _Transform, hidden: Collection[str]) -> Notation:
             sigmas_m = np.where(sigmas_m > UNKNOWN_M, np.inf, sigmas_m)
     is_rotation_known = not {*ROTATIONS} & {*hidden}
     sigmas = sigmas_rpy(T, measured)
-    # Near gimbal lock, roll and yaw are known but have no standard deviation.
+    # Near gimbal lock, roll and yaw are known, but without a standard deviation.
     is_known = np.isfinite(sigmas) | is_rotation_known
     return Notation(
         maps=f"coordinates of {transform.source} into {transform.target}",
@@ -275,7 +276,7 @@ def _inliers_in_words(result: Result) -> dict[str, str]:
 
 
 def summary(result: Result) -> dict[str, str]:
-    """Return how a result was solved: names of quantities, and their values as text."""
+    """Return quantities of the solve with their values as text."""
     rate = result.clock_rate
     proof = {"yes": "", "no": "not "}
     offset = result.time_offset_s
@@ -302,7 +303,7 @@ def summary(result: Result) -> dict[str, str]:
             f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
         )
     if result.noise:
-        # Documents begin the first sentence with the name of this row.
+        # In documents, the first sentence begins with the name of this row.
         sentences = [
             text.removeprefix("Noise: ").rstrip(".")
             for text in result.noise.in_words
@@ -343,7 +344,7 @@ def printed_numbers(
 
 
 def parts_of_sigmas(transform: Notation) -> dict[str, str]:
-    """Return the measured part and the allowance of each standard deviation in words, by axis.
+    """Return both parts of each standard deviation, measured and allowance, in words by axis.
 
     An example is "4 mm measured, 8 mm allowance". Axes with a negligible allowance and unknown axes
     are left out.
@@ -373,20 +374,20 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
 def angles_in_words(transform: Notation, result: Result) -> str:
     """Explain angles that are less or more certain than the rotation; empty if none is.
 
-    Near a pitch of 90 deg, roll and yaw vary together: a small rotation changes both by much.
-    Angles are about fixed axes, one after the other. So their standard deviations may be others
-    than those about the axes of the target. Unknown axes are ignored.
+    Near a pitch of 90 deg, a small rotation changes both roll and yaw by much. The three angles are
+    applied one after the other about fixed axes, so their standard deviations may differ from those
+    about the axes of the target. Unknown axes are ignored.
     """
     sigmas_rad = result.sigmas[3:]
     sigmas_deg = np.asarray(transform.sigma_rpy_deg)
-    # Near a pitch of 90 deg, angles are unknown although the rotation is known.
+    # Near a pitch of 90 deg, angles may be unknown although the rotation is known.
     are_known = np.isfinite(sigmas_rad)
     if not are_known.all():
         are_known &= np.isfinite(sigmas_deg)
     if not are_known.any():
         return ""
     rotation_rad = float(sigmas_rad[are_known].max())
-    # Angles that are printed to the digits of the rotation need no explanation.
+    # If the digits of the angles and of the rotation are equal, no explanation is needed.
     excess_deg = float(sigmas_deg[are_known].max()) - math.degrees(rotation_rad)
     if not round(excess_deg, 1) > 0.0:
         return _about_axes_in_words(transform, are_known, result)
@@ -399,10 +400,10 @@ def angles_in_words(transform: Notation, result: Result) -> str:
 
 
 def _differs_from_headline(transform: Notation, result: Result) -> bool:
-    """Return whether the headline has another rotation sigma than the angles of a transform.
+    """Return whether the rotation sigma of the headline differs from those of the angles.
 
     The headline has the largest standard deviation about the parent's axes. Other transforms have
-    other axes, so they are not compared.
+    other axes, and are not compared.
     """
     about_rad = np.radians(transform.sigma_about_deg)
     angles_rad = np.radians(transform.sigma_rpy_deg)
@@ -419,9 +420,9 @@ def _differs_from_headline(transform: Notation, result: Result) -> bool:
 def _about_axes_in_words(
     transform: Notation, are_known: BoolArray, result: Result
 ) -> str:
-    """Return the standard deviations about x, y and z if those of the angles differ from them.
+    """Return the standard deviations about x, y and z, if they differ from those of the angles.
 
-    ``are_known`` (3,) says which axes are determined; the others are left out.
+    ``are_known`` (3,) marks the determined axes. The others are left out.
     """
     about_deg = np.asarray(transform.sigma_about_deg)
     are_known = are_known & np.isfinite(about_deg)
@@ -476,7 +477,7 @@ def usable_numbers(result: Judged) -> dict[str, float | str]:
     unknown = {*result.unobservable()}
     hidden = np.array([axis in unknown for axis in TRANSLATIONS])
     if result.T_base_parent is not None:
-        # An axis of the base is unknown if an unknown axis of the parent has a component along it.
+        # An axis of the base is unknown if it has a component along an unknown axis of the parent.
         components = np.abs(se3.rotation_of(result.T_base_parent)[:, hidden])
         hidden = components.max(axis=1, initial=0.0) > _SHARED
     numbers: dict[str, float | str] = {
@@ -519,7 +520,7 @@ def usable_angles(result: Result) -> dict[str, float | str]:
     The value of an unknown angle is a text that every parser refuses.
     """
     T = result.mounting[1]
-    # Near gimbal lock, roll and yaw are known but have no standard deviation.
+    # Near gimbal lock, roll and yaw are known, but without a standard deviation.
     are_known = np.full(3, True)
     if set(result.unobservable()).intersection(ROTATIONS):
         are_known = np.isfinite(sigmas_rpy(T, result.covariance_measured))

@@ -10,7 +10,7 @@ from hand_eye_calib.core.base.registry import RESULT_PARTS
 
 
 class ExtraTransform(NamedTuple):
-    """A transform of a part; it maps coordinates of ``source`` into ``target``.
+    """Transform of a part. It maps coordinates of ``source`` into ``target``.
 
     ``covariance`` (6, 6) is the covariance of its error, in the frame ``source``.
     """
@@ -22,7 +22,7 @@ class ExtraTransform(NamedTuple):
 
 
 class Part:
-    """A part that is a single record; it has the same name in results and documents.
+    """Part that is a single record. It has the same name in results and documents.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Part:
     Attributes
     ----------
     without : mapping of str to object
-        Attributes that the part adds to a result, and their values if the result lacks the part.
+        Attributes that the part adds to a result, with the values they have without the part.
     file_names : tuple of str
         Names of the files that :meth:`files` may return.
     """
@@ -58,7 +58,7 @@ class Part:
         return value
 
     def write(self, value: Any) -> Document:
-        """Return the fields of a document for the part; ``value`` is None for a missing part."""
+        """Return the fields of a document for the part. A missing part has the ``value`` None."""
         return {self.name: value}
 
     def read(self, document: Mapping[str, Any]) -> Any:
@@ -67,7 +67,7 @@ class Part:
         Raises
         ------
         KeyError, TypeError, ValueError
-            If a value is missing or was changed.
+            If a value is missing or damaged.
         """
         value = document.get(self.name)
         if value is None:
@@ -90,19 +90,19 @@ class Part:
         return self._details(value, result) if self._details else []
 
     def facts(self, value: Any, result: Any) -> list[str]:
-        """Return further lines, which are printed if a person asks for all details."""
+        """Return further lines about the part, for a user who requests all details."""
         return []
 
     def files(self, value: Any, result: Any) -> dict[str, str]:
-        """Return the texts of files that are saved beside a usable result, by their names."""
+        """Return files to be saved beside a usable result: their names and texts."""
         return {}
 
     def advice(self, value: Any, result: Any) -> str:
-        """Return what to record next, for a result that is not USE; empty without advice."""
+        """Return what to record next if the result is not USE; empty without advice."""
         return ""
 
     def headline(self, value: Any) -> str:
-        """Return a note on the part for the headline of a usable result; empty without a note."""
+        """Return a note on the part for the headline of a usable result; empty without one."""
         return ""
 
 

@@ -9,7 +9,7 @@ from hand_eye_calib.core.base.spelling import Interface, with_options
 
 
 class Verdict(str, Enum):
-    """Whether a result may be used.
+    """Verdict on whether a result may be used.
 
     Examples
     --------
@@ -36,7 +36,7 @@ class Reason:
         Name of the rule in :data:`~hand_eye_calib.core.results.rules.RULES`. It does not change
         between versions.
     verdict : Verdict
-        The verdict on the result if this were the only reason.
+        Verdict on the result if there were no other reason.
     sentence : str
         The problem, with its values.
     advice : str
@@ -46,8 +46,8 @@ class Reason:
     options : mapping
         Options that repair the problem, by their public names.
     kind : {"physics", "suspicion"}
-        "physics" for a limit of the motion, the recording or the sensors; "suspicion" for a sign of
-        a fault.
+        "physics" for a limit of the motion, the recording or the sensors; "suspicion" for a
+        possible fault.
 
     Examples
     --------
@@ -66,7 +66,7 @@ class Reason:
 
     @property
     def what_to_do(self) -> str:
-        """The advice with its options, as a Python program gives them."""
+        """Advice with options in the spelling of Python."""
         return self.advice_on(Interface.PYTHON)
 
     def advice_on(self, interface: Interface) -> str:
@@ -80,7 +80,7 @@ class Reason:
 
 
 class Ground(NamedTuple):
-    """What a rule reports about one result: a :class:`Reason` without its rule and verdict."""
+    """Result of a rule: a :class:`Reason` without the name of the rule and its verdict."""
 
     sentence: str
     advice: str

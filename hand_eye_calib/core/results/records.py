@@ -17,7 +17,7 @@ from hand_eye_calib.core.base.registry import FINDING_WORDS
 from hand_eye_calib.core.base.spelling import Interface, with_options
 from hand_eye_calib.core.geometry.trajectory import Columns
 
-# Motion pairs with more weight than this count as inliers.
+# Motion pairs with a larger weight than this are inliers.
 INLIER_WEIGHT = 0.5
 
 
@@ -54,7 +54,7 @@ class SolveStatus(str, Enum):
 
 
 class DofVerdict(str, Enum):
-    """How well a degree of freedom is known; PRIOR if mostly or only a prior determines it."""
+    """Knowledge about a degree of freedom; PRIOR if mostly or only a prior determines it."""
 
     OBSERVED = "observed"
     WEAK = "weak"
@@ -72,8 +72,8 @@ class DofObservability:
         x, y, z (translation) or roll, pitch, yaw (rotation about x, y, z).
     verdict : DofVerdict
     sigma : float
-        One standard deviation, m or rad; ``inf`` if unobservable. It contains the allowance for
-        constant errors in rows of ``observability``, not in rows of ``observability_measured``.
+        One standard deviation, m or rad; ``inf`` if unobservable. In ``observability`` it contains
+        the allowance for constant errors; in ``observability_measured`` it does not.
     """
 
     name: str
@@ -130,12 +130,12 @@ class Residuals(Columns):
 
     @property
     def is_inlier(self) -> BoolArray:
-        """Whether (K,) each pair counts as an inlier."""
+        """Mask (K,) of the pairs that are inliers."""
         return self.weights > INLIER_WEIGHT
 
 
 class Severity(str, Enum):
-    """How much a finding matters.
+    """Severity of a finding.
 
     An error makes results from these streams unusable. A result with a warning may be used with
     care. A note does not restrict the use.
@@ -148,10 +148,10 @@ class Severity(str, Enum):
 
 # Codes of notes that the user can act on. All other notes have no advice.
 _NOTES_WITH_ADVICE = ("one_axis",)
-#: Advice of all other notes.
+#: Advice for all other notes.
 NO_ACTION = "no action is needed"
 
-#: Key of the templates for a finding that stores its sentences among its values.
+#: Key of the templates for a finding whose values include its sentences.
 AS_WRITTEN = "as_written"
 
 
@@ -172,7 +172,7 @@ class Finding:
         "parent", "child" or "both".
     severity : Severity
     values : mapping of str to number or str
-        Values for the sentences, and other numbers that were measured.
+        Values in the sentences, and other measured numbers.
     options : mapping
         Options that repair the problem, by their names in :mod:`hand_eye_calib.core.base.config`;
         empty if no option repairs it.
@@ -197,7 +197,7 @@ class Finding:
 
     @property
     def what_to_do(self) -> str:
-        """The advice with its options, as a Python program gives them."""
+        """Advice with options in the spelling of Python."""
         return self.advice_on(Interface.PYTHON)
 
     def advice_on(self, interface: Interface) -> str:
@@ -225,7 +225,7 @@ class Finding:
 
     @property
     def makes_unusable(self) -> bool:
-        """Whether a result is unusable unless this fault of the streams is repaired."""
+        """Whether a result is unusable as long as this fault is not repaired."""
         return self.severity is Severity.ERROR
 
     def to_dict(self) -> Document:
@@ -239,8 +239,8 @@ class Finding:
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Build from the mapping that :meth:`to_dict` returned.
 
-        The sentences of the mapping are kept if this installation has no templates for its values.
-        Such a mapping comes from another version, or from an extra that is not installed.
+        If this installation has no templates for the values, the sentences of the mapping are kept.
+        The mapping is then from another version, or from an extra that is not installed.
 
         Raises
         ------
@@ -251,7 +251,7 @@ class Finding:
             finding: Self = from_plain(cls, data)
             if finding._has_templates():
                 return finding
-        # Store the sentences among the values, with templates that only repeat them.
+        # Store the sentences among the values, with templates that only insert them.
         values: Document = from_plain(
             dict[str, float], data.get("evidence", {})
         )
@@ -315,12 +315,12 @@ def gravest_first(findings: Sequence[Finding]) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrelatedError:
-    """A time-correlated error of the trajectories.
+    """Time-correlated error of the trajectories.
 
     Attributes
     ----------
     kind : str
-        "body", "world" or "path": the frame in which the error stays constant for about ``tau_s``.
+        "body", "world" or "path": the frame in which the error is constant for about ``tau_s``.
     part : str
         Part of the poses or of the path that has the error.
     sigma : float
@@ -363,7 +363,7 @@ class ClockRate:
         Microseconds to add to the child's stamps per second after ``at_ns``, and one standard
         deviation. Positive if the child's clock is slow.
     at_ns : int
-        Stamp of the child's clock at which the time offset is valid.
+        Stamp on the child's clock at which the time offset is valid.
     is_used : bool
         Whether the rate is significant, so that the child's stamps were corrected.
     """
@@ -390,20 +390,21 @@ class AxisScatter:
     Attributes
     ----------
     sigma : float or None
-        Standard deviation of the result, with the allowance and without the scatter of other
+        Standard deviation of the result, with the allowance but without the scatter of other
         estimates; None if the axis is unobservable.
     of_methods : float or None
-        Robust standard deviation of estimates by robust least squares about the result.
+        Robust standard deviation of other estimates (robust least squares) about the result.
     of_halves : float or None
         Standard deviation computed from the difference between both halves of the recording.
     excess_of_methods, excess_of_halves : float or None
-        The same two, divided by the joint standard deviation. The joint standard deviation contains
-        the allowance; for halves and a result of the noise model, also the one of the result.
+        ``of_methods`` and ``of_halves``, divided by the joint standard deviation. The joint
+        standard deviation contains the allowance. For halves and a result of the noise model, it
+        also contains the standard deviation of the result.
     excess_over_own : float or None
-        Robust standard deviation of the estimates that are about as certain as the result, divided
-        by the result's own standard deviation.
+        Robust standard deviation of the other estimates that are about as certain as the result,
+        divided by the standard deviation of the result.
     is_confirmed : bool
-        False if the result determines the axis and no other estimate does.
+        False if the result determines the axis, but no other estimate does.
     """
 
     sigma: float | None

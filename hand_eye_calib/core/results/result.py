@@ -1,4 +1,4 @@
-"""An extrinsic and its quality, as values."""
+"""Extrinsic and its quality as values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -41,17 +41,17 @@ class Result:
         Pose of the child sensor in the parent sensor's frame: maps child coordinates (m) into the
         parent frame.
     T_method : (4, 4) array or None
-        Solution of the method, before unobservable directions are set and priors are added. None
-        if the result was read from a file without this solution.
+        Solution of the method before priors were added and unobservable directions were set. None
+        if the result was read from a file without it.
     status : SolveStatus
     objective : float
         Value of the method's cost at ``T_method``; for dnlo eq. (5), with the cost of outliers.
     proved_global : str
-        Whether it is proved that no transform has a smaller cost over the inliers: "yes", "no", or
-        "not tried" (:mod:`hand_eye_calib.core.solvers.certificate`).
+        Whether no transform has a smaller cost over the inliers: "yes" (proved), "no", or "not
+        tried" (:mod:`hand_eye_calib.core.solvers.certificate`).
     method, reference, backend : str
-        Method, reference and backend of the solve. They are the chosen ones if the user set
-        ``auto``.
+        Method, reference and backend of the solve. If the user set ``auto``, they are the chosen
+        ones.
     method_reason, reference_reason : str
         Why ``auto`` chose the method and the reference; empty if the user set them.
     time_offset_s, time_offset_sigma_s : float
@@ -69,22 +69,22 @@ class Result:
         Covariance of the error xi in ``T_parent_child @ exp(xi)``, xi = (rho, phi), in the child
         sensor's frame, m and rad: the part that is estimated from the recording.
     covariance_allowance : (6, 6) array
-        Covariance of the same xi due to errors that are constant during the recording, so that
-        they cannot be estimated from it (:mod:`hand_eye_calib.core.assessment.covariance`).
+        Covariance of the same xi by errors that are constant during the recording, so that the
+        recording cannot reveal them (:mod:`hand_eye_calib.core.assessment.covariance`).
         :attr:`covariance` is the sum of both.
     observability_measured : tuple of DofObservability
-        x, y, z, roll, pitch, yaw in the parent sensor's frame, with standard deviations without the
-        allowance. Those of :attr:`observability` contain the allowance.
+        x, y, z, roll, pitch, yaw in the parent sensor's frame. The standard deviations are without
+        the allowance, unlike those of :attr:`observability`.
     contradictions : mapping
-        Axes whose prior contradicts the motion, and the distances in joint standard deviations.
+        Axes whose prior contradicts the motion, with the distances in joint standard deviations.
 
     Data
 
     measured : {"poses", "rotations", "positions"}
         Quantity that both streams measure together. Rotations (and angular rates) do not determine
-        the translation; positions do not determine the rotation: see :attr:`out_of_reach`.
+        the translation. Positions do not determine the rotation. See :attr:`out_of_reach`.
     n_poses, n_pairs, n_inliers : int
-        Synchronised pose pairs, motion pairs, and motion pairs that count as inliers.
+        Numbers of synchronised pose pairs, of motion pairs, and of motion pairs that are inliers.
     stamp_ns : int
         Stamp of the newest pose used, parent clock.
     motion_residuals : Residuals or None
@@ -100,18 +100,18 @@ class Result:
     findings : tuple of Finding
         Findings of the stream checks.
     cross_check : CrossCheck or None
-        Scatter of other estimates about this one, by axis: of motions over other numbers of poses,
-        and of both halves of the recording. None without a cross-check.
+        Scatter of other estimates about the result, by axis: from motions over other numbers of
+        poses, and from both halves of the recording. None without a cross-check.
     warnings : tuple of str
         Messages for the user of the result.
     recording : object
-        The poses and options of the solve, for :meth:`Calibration.report`. Not part of files.
+        Poses and options of the solve, for :meth:`Calibration.report`. They are not part of files.
 
     Context
 
     parent_frame, child_frame : str
     base_frame : str
-        A frame of the robot; the child's pose is stated in this frame, too. May be empty.
+        Frame of the robot in which the child's pose is also stated. May be empty.
     T_base_parent : (4, 4) array or None
         Pose of the parent sensor in ``base_frame``, from the robot's transforms.
     target_translation, target_rotation : float
@@ -122,7 +122,7 @@ class Result:
         Comparison with the installed transform.
     parts : mapping
         Records of layers above the core, by name: ``goal``, ``together``, ``rate_bias``,
-        ``worlds``. A result has their values as attributes, too
+        ``worlds``. Their values are also attributes of the result
         (:mod:`hand_eye_calib.core.results.parts`).
     """
 
@@ -179,11 +179,11 @@ class Result:
         # tf2 refuses the leading slash of ROS 1.
         for name in _FRAMES:
             frame = getattr(self, name)
-            # A file that was changed by hand may have values of other types.
+            # In a file that was changed by hand, values may have other types.
             if isinstance(frame, str):
                 object.__setattr__(self, name, frame_name(frame))
 
-    # Hidden from type checkers, so that they still report misspelt attributes.
+    # Type checkers do not see this method, so that they still report misspelt attributes.
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
@@ -241,9 +241,9 @@ class Result:
 
     @property
     def mounting(self) -> tuple[str, FloatArray]:
-        """The frame that the child sensor is mounted on, and the child's pose (4, 4) in this frame.
+        """Frame on which the child sensor is mounted, and the child's pose (4, 4) in this frame.
 
-        The frame is the base frame if there is one, otherwise the parent sensor's.
+        It is the base frame if there is one, otherwise the frame of the parent sensor.
         """
         if self.T_base_child is not None:
             return self.base_frame, self.T_base_child
@@ -268,12 +268,12 @@ class Result:
 
     @property
     def sigmas_measured(self) -> FloatArray:
-        """(6,) array: the part of :attr:`sigmas` that is estimated from the recording."""
+        """(6,) array: part of :attr:`sigmas` that is estimated from the recording."""
         return np.array([dof.sigma for dof in self.observability_measured])
 
     @property
     def allowance(self) -> FloatArray:
-        """(6,) array: the part of :attr:`sigmas` that allows for constant errors.
+        """(6,) array: part of :attr:`sigmas` that covers constant errors.
 
         Constant errors of odometries cannot be estimated from a recording.
         """
@@ -295,8 +295,8 @@ class Result:
     def sigmas_rpy(self) -> FloatArray:
         """(3,) array: standard deviations (rad) of roll, pitch and yaw, with the allowance.
 
-        They are infinite for unknown angles. They differ from those of ``sigmas``, which are of
-        rotations about the parent's axes.
+        The values are infinite for unknown angles. They differ from ``sigmas``, which has rotations
+        about the parent's axes.
         """
         return sigmas_rpy(self.T_parent_child, self.covariance)
 
@@ -332,7 +332,7 @@ class Result:
 
     @property
     def hidden(self) -> list[str]:
-        """Names of the axes that these streams could determine, but this recording does not."""
+        """Names of the axes that these streams can determine, but this recording does not."""
         return [
             axis
             for axis in self.unobservable()

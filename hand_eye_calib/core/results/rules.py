@@ -1,8 +1,8 @@
 """Rules that lead to a verdict.
 
-Each rule of :data:`RULES` examines a result and yields grounds: reasons not to use the result. The
-rules are sorted, the most serious first. The first rule that yields a ground decides the verdict.
-docs/verdict.md has the same table; a test compares the two tables.
+Each rule of :data:`RULES` examines a result and yields grounds, which are reasons not to use the
+result. The gravest rule is first. The first rule with a ground decides the verdict. docs/verdict.md
+has the same table, and a test compares both.
 """
 
 import math
@@ -38,7 +38,7 @@ from hand_eye_calib.core.results.result import Result
 class Rule(NamedTuple):
     """A row of the table of rules.
 
-    ``when`` is the condition in words. ``find(result)`` yields a ground if the condition is met.
+    ``when`` is the condition in words. ``find(result)`` yields a ground if the condition is true.
     """
 
     name: str
@@ -47,30 +47,31 @@ class Rule(NamedTuple):
     find: Callable[[Result], Iterator[Ground]]
 
 
-# Other estimates contradict a result on an axis if two limits are exceeded. This one is in joint
-# standard deviations of the scatter of the estimates about the result. A contradiction never leads
-# to DO NOT USE, because the other methods do not model time-correlated errors.
+# Other estimates contradict a result on an axis if their scatter about the result exceeds two
+# limits. First limit: this number of joint standard deviations. A contradiction never leads to DO
+# NOT USE, because the other methods do not model time-correlated errors.
 CONTRADICTED_SIGMAS = 3.0
-# The second limit of the scatter, as a share of the target of the axis.
+# Second limit of the scatter, as a share of the target of the axis.
 CONTRADICTED_SHARE = 0.25
 
-# Estimates that are about as certain as the result have a second test. They contradict the result
-# if their scatter exceeds CONTRADICTED_SIGMAS standard deviations of the result, and this multiple
-# of the target. The uncertainty of the estimates cannot explain such a scatter.
+# Estimates that are about as certain as the result have another test. They contradict the result if
+# their scatter exceeds CONTRADICTED_SIGMAS standard deviations of the result, and also this
+# multiple of the target. The uncertainty of the estimates cannot explain such a scatter.
 CONTRADICTED_TARGETS = 2.0
 
-# Smallest share of inliers among the motion pairs. Below it, the rule "outliers" yields a ground.
+# Smallest share of inliers among the motion pairs. With less, the rule "outliers" yields a ground.
 FEWEST_INLIERS = 0.7
 
-# The same share for the adaptive method. It is larger, because the noise model of this method
-# rejects only outliers. A tenth of all poses as outliers spoils a fifth of the pairs.
+# The same share for the adaptive method. It is larger, because the noise model rejects only
+# outliers. If a tenth of all poses are outliers, a fifth of the pairs are wrong.
 FEWEST_OF_MODEL = 0.8
 
-# The same share of the windows of a vehicle. The outliers are slips, which do not spoil neighbours.
+# The same share for the windows of a vehicle. Their outliers are slips, which do not affect
+# neighbouring windows.
 FEWEST_OF_WINDOWS = 0.9
 
-# Texts of the rules "halves" and "methods", in three parts: which estimates disagree, the
-# introduction to the standard deviations of the result, and what the user should do.
+# Texts of the rules "halves" and "methods", in three parts: the estimates that disagree, the words
+# before the standard deviations of the result, and the advice.
 _CONTRADICTION_TEXTS = {
     "halves": (
         "the two halves of the recording disagree",
@@ -86,7 +87,7 @@ _CONTRADICTION_TEXTS = {
 
 
 def _not_converged(result: Result) -> Iterator[Ground]:
-    # If an error finding explains why there is no solution, this rule adds nothing.
+    # If an error finding already explains why there is no solution, this rule adds nothing.
     if result.status is SolveStatus.NOT_CONVERGED and not has_error(
         result.findings
     ):
@@ -114,7 +115,7 @@ def _contradicted(result: Result) -> Iterator[Ground]:
 def _nothing_known(result: Result) -> Iterator[Ground]:
     if result.reference in ("stops", "windows") and has_error(result.findings):
         # If stops contradict each other, or a vehicle always drives the same curve, an error
-        # finding names the cause.
+        # finding names this cause.
         return
     if all(axis.is_hidden for axis in axes_within_reach(result)):
         yield Ground(
@@ -146,7 +147,7 @@ def _findings_of(severity: Severity, result: Result) -> Iterator[Ground]:
 def _contradiction(kind: str, result: Result) -> Iterator[Ground]:
     """Yield a ground if other estimates contradict the result on some axes.
 
-    ``kind`` is "halves" or "methods": the origin of the other estimates.
+    ``kind`` is "halves" or "methods", the source of the other estimates.
     """
     distances = {}
     sigmas = []
@@ -225,7 +226,7 @@ def _hidden(result: Result) -> Iterator[Ground]:
 def _hidden_ground(result: Result, source: str) -> Ground:
     """Return the ground that some axes are unobservable.
 
-    ``source`` names what does not determine them, such as "this motion".
+    ``source`` is the cause, such as "this motion".
     """
     axes = tuple(
         axis.name for axis in axes_within_reach(result) if axis.is_hidden
@@ -288,8 +289,8 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     allowances = [
         (axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough
     ]
-    # The target cannot be reached if the allowance alone is above it. A longer recording still
-    # helps if the allowance is less than half of the rest.
+    # If the allowance alone exceeds the target, the target cannot be reached. If the allowance is
+    # less than half of the rest, a longer recording still helps.
     hopeless = [
         (axis.name, size) for axis, size in allowances if size > axis.target
     ]
@@ -314,7 +315,7 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
 
 
 def _floor(result: Result) -> Iterator[Ground]:
-    """Yield the ground that the allowance alone puts axes above their target."""
+    """Yield the ground that the allowance alone exceeds the target of some axes."""
     above = [
         axis
         for axis in axes_within_reach(result)
@@ -370,7 +371,7 @@ _OWN_RULES = (
         "a stream check found an error",
         partial(_findings_of, Severity.ERROR),
     ),
-    # After the error findings, because faults of the streams are often the cause.
+    # This rule is after the error findings, because faults of the streams are often the cause.
     Rule(
         "not_converged",
         _NEVER,

@@ -26,10 +26,10 @@ from hand_eye_calib.core.results.result import Result
 # Versions of documents that are read.
 _READABLE = (1, 2)
 
-# Fields that functions of their own read.
+# Fields with their own reading functions.
 _READ_APART = (*NOT_IN_FILES, "findings")
 
-# Names of the covariances in version 2, and their names in version 1.
+# Names of the covariances in version 2, with their names in version 1.
 _OLD_COVARIANCES = {
     "covariance_measured": "covariance",
     "covariance_allowance": "floor",
@@ -39,7 +39,7 @@ _OfResult = TypeVar("_OfResult", bound=Result)
 
 
 def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """Build a calibration from its document, which may be damaged or changed by hand.
+    """Make a calibration from its document, which may be damaged or changed by hand.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _measured_parts(data: Mapping[str, Any]) -> Document:
-    """Return a document of any version with the measured parts under the names of version 2."""
+    """Return a document of any version, with measured parts under the names of version 2."""
     document = dict(data)
     if data["version"] == 1:
         document |= {
@@ -96,7 +96,7 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
 
 
 def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
-    """Build a result from a document of the right format.
+    """Make a result from a document of the right format.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _with_allowance(result: Result) -> CrossCheck:
-    """Add the allowance to the standard deviations of a cross-check of version 1."""
+    """Add the allowance to the standard deviations of a cross-check in version 1."""
     sizes = dict(zip(AXES, result.allowance.tolist(), strict=True))
     rows = dict(result.cross_check or {})
     for axis, row in rows.items():
@@ -178,7 +178,7 @@ def covariance_of(data: Mapping[str, Any]) -> FloatArray:
     matrix = _matrix(data, 6)
     is_known = np.isfinite(matrix)
     sigmas = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    # A correlation of 1 may be a little larger due to rounding.
+    # Rounding may make a correlation slightly larger than 1.
     bounds = (1 + 1e-6) * np.outer(sigmas, sigmas) + 1e-300
     is_symmetric = np.allclose(matrix, matrix.T, rtol=1e-6)
     if not (

@@ -1,4 +1,4 @@
-"""The verdict on a result: the reasons that the rules find, and the headline."""
+"""Verdict on a result: reasons from the rules, and headline."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -20,7 +20,7 @@ from hand_eye_calib.core.results.records import (
 from hand_eye_calib.core.results.result import Result
 from hand_eye_calib.core.results.rules import RULES
 
-# Kinds of the rules that report a limit of the recording. All other rules report a suspicion.
+# Rules that report a limit of the recording. All other rules report a suspicion.
 _KINDS = dict.fromkeys(
     ("nothing_known", "unobservable", "unconfirmed", "target", "floor"),
     "physics",
@@ -33,7 +33,7 @@ class Judged(Result):
 
     @cached_property
     def reasons(self) -> tuple[Reason, ...]:
-        """Reasons why the result should not be used without further steps, most serious first.
+        """Reasons against using the result without further steps, the gravest first.
 
         The tuple is empty if the result may be used. The rules are
         :data:`hand_eye_calib.core.results.rules.RULES`.
@@ -60,7 +60,7 @@ class Judged(Result):
 
     @property
     def headline(self) -> str:
-        """The verdict with its gravest reason, or with the accuracy, in one line."""
+        """Verdict with its gravest reason, or with the accuracy, in one line."""
         return f"{self.verdict.value}: {self.sentence}"
 
     @property
@@ -76,7 +76,7 @@ class Judged(Result):
             them = hidden if len(first.axes) == 1 else "them"
             text = f"all but {hidden}; measure {them} by hand"
             if self.out_of_reach:
-                # Axes out of reach are not among the hidden axes, and are not known either.
+                # Axes out of reach are not hidden, but they are not known either.
                 axes = axes_within_reach(self)
                 known = listing(
                     [axis.name for axis in axes if not axis.is_hidden]
@@ -89,7 +89,7 @@ class Judged(Result):
             if others:
                 text += f" (and {counted(len(others), 'more reason')})"
             is_limit = all(reason.kind == "physics" for reason in self.reasons)
-            # A warning may be about a fault that was repaired, or about a possible one.
+            # A warning may be about a fault that was repaired, or about a possible fault.
             if is_limit and not self.warnings:
                 text += f"; {_NO_FAULT}"
             if self.verdict is Verdict.DO_NOT_USE:
@@ -98,15 +98,15 @@ class Judged(Result):
 
     @property
     def reasons_in_headline(self) -> tuple[Reason, ...]:
-        """Reasons whose sentences the headline contains."""
+        """Reasons whose sentences are in the headline."""
         gravest = shown(self.reasons)
         if gravest and gravest[0].rule == "unobservable":
-            # The headline states the first reason in other words.
+            # The headline already has the first reason, in other words.
             return gravest[1:2]
         return gravest[:1]
 
     def _notes(self) -> list[str]:
-        """Notes for the headline: those of parts, and of findings that do not lower the verdict."""
+        """Notes for the headline, from parts and from findings that do not lower the verdict."""
         notes = [
             part(name).headline(value) for name, value in self.parts.items()
         ]
@@ -117,9 +117,9 @@ class Judged(Result):
 
 
 def _is_notable(finding: Finding) -> bool:
-    """Return whether a finding that does not lower the verdict belongs in the headline.
+    """Return whether a note belongs in the headline, although it does not lower the verdict.
 
-    It does if the finding changes the meaning of the numbers.
+    Such notes change the meaning of the numbers.
     """
     return (
         finding.code in ("model_scale", "outliers")
@@ -128,9 +128,9 @@ def _is_notable(finding: Finding) -> bool:
 
 
 def shown(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
-    """Return the reasons to be printed: those with the most serious verdict.
+    """Return the reasons that are printed: those with the gravest verdict.
 
-    The other reasons may be consequences of the printed ones.
+    Other reasons may be consequences of the printed reasons.
     """
     return tuple(
         reason for reason in reasons if reason.verdict is reasons[0].verdict

@@ -1,16 +1,16 @@
-"""Solvers that give all motion pairs the same weight, and the solution type of all solvers.
+"""Solvers with the same weight for all motion pairs, and the solution type of all solvers.
 
 Park and Taylor solve AX = XB in two steps, with the rotation vectors a, b of the motions A and B:
 
     min sum |a - R b|^2,    then    min sum |(R_A - I) t - (R t_B - t_A)|^2
 
-They are the initial stages of the methods of C. Park, P. Moghadam, S. Kim, S. Sridharan, C. Fookes,
-*Spatiotemporal camera-LiDAR calibration: a targetless and structureless approach*, IEEE Robotics
-and Automation Letters 5(2), 2020, and of Z. Taylor, J. Nieto, *Motion-based calibration of
-multimodal sensor arrays*, IEEE International Conference on Robotics and Automation, 2015, with
-equal weights for all motions. Both methods solve the same two least-squares problems, and their
-published results differ only by rounding. Both have a name here, because the comparison of Välimäki
-et al. (2023) lists both.
+They are the first stages of two methods, with equal weights for all motions: C. Park, P. Moghadam,
+S. Kim, S. Sridharan, C. Fookes, *Spatiotemporal camera-LiDAR calibration: a targetless and
+structureless approach*, IEEE Robotics and Automation Letters 5(2), 2020, and Z. Taylor, J. Nieto,
+*Motion-based calibration of multimodal sensor arrays*, IEEE International Conference on Robotics
+and Automation, 2015. Both solve the same two least-squares problems, and their published results
+differ only by rounding. Both names exist here, because the comparison of Välimäki et al. (2023)
+lists both.
 
 DNL minimises ``sum |A X - X B|_F^2``: direct non-linear optimisation (Välimäki et al. 2023, eq. 4).
 
@@ -48,7 +48,7 @@ class Solution:
     objective : float
         Cost of the method at X.
     converged : bool
-        Whether the iteration converged. If not, X is the best transform that was reached.
+        Whether the iteration converged. If it did not, X is the best transform so far.
     weights : (K,) array
         Weight of each motion pair; 1 if the method does not reject outliers.
     """
@@ -104,9 +104,9 @@ def align_rotation_vectors(
     """Estimate the rotation R (3, 3) of X from rotation vectors a of the parent and b of the child.
 
     ``R_A = R R_B R'`` means ``a = R b``. The least squares solution comes from the singular value
-    decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976); a reflection is corrected
-    to a rotation. No centroid is subtracted, because the vectors have a common origin. If a
-    rotation is close to pi, the sign of its vector is random.
+    decomposition of the 3 x 3 correlation of the vectors (Kabsch 1976), where a reflection is
+    corrected to a rotation. The vectors have a common origin, so no centroid is subtracted. Near
+    pi, the sign of a rotation vector is random.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _lowest_minimum(
 
 
 def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
-    """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than from condensed forms."""
+    """Return the costs ``|A X - X B|_F^2`` (K,), with more digits than the condensed forms."""
     return quadratic_form.costs(
         quadratic_form.coefficients(pairs), T_parent_child
     )
@@ -176,12 +176,12 @@ def pair_costs(pairs: MotionPairs, T_parent_child: FloatArray) -> FloatArray:
 def start_rotations(pairs: MotionPairs) -> FloatArray:
     """Return rotations (4, 3, 3) of X from which iterations start.
 
-    The first rotation aligns the child's rotation axes with the parent's. It is close to the
-    solution if the sensors rotate. The other three are the first one after a rotation of the child
-    by pi about one of its axes. They help if the sensors hardly rotate.
+    The first rotation aligns the rotation axes of both sensors. It is near the solution if the
+    sensors rotate. The other three add a rotation of the child by pi about one of its axes. They
+    help if the sensors hardly rotate.
     """
-    # The antisymmetric part of a rotation matrix has the direction of the rotation axis. It takes
-    # less time than a rotation vector.
+    # The antisymmetric part of a rotation matrix has the direction of the rotation axis, and is
+    # faster to compute than a rotation vector.
     axes_parent = se3.vee(pairs.Ts_parenti_parentj)
     axes_child = se3.vee(pairs.Ts_childi_childj)
     U, _, V_transposed = np.linalg.svd(axes_parent.T @ axes_child)

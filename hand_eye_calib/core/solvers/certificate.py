@@ -1,4 +1,4 @@
-"""Proof that a minimum of a quadratic form over SE(3) is the global one.
+"""Proof that a minimum of a quadratic form over SE(3) is the global minimum.
 
 After the translation is eliminated, the cost is ``x' M x`` in ``x = (vec R, 1)``. A rotation
 satisfies 20 independent quadratic equations: its rows and its columns are orthonormal and
@@ -13,8 +13,9 @@ for some choice of the multipliers, no rotation has a smaller cost. This is Lagr
 Giamou et al., *Certifiably globally optimal extrinsic calibration from per-sensor egomotion*, RA-L
 2019).
 
-The coordinates are rotated so that the minimum is the identity. Then the terms that depend only on
-the equations are constants. A Newton iteration in 14 multipliers with matrices of 9 x 9 remains.
+The coordinates are rotated so that the minimum is the identity. The terms that depend only on the
+equations are then constant. The rest is a Newton iteration in 14 multipliers with matrices of 9 x
+9.
 """
 
 from functools import cache
@@ -26,16 +27,16 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.solvers import quadratic_form
 
-# A minimum is proved to be global if the lower bound of the cost is below the minimum by at most
-# this share of it ...
+# A minimum is proved to be global if it exceeds the lower bound of the cost by at most this share
+# ...
 _MAX_RELATIVE_GAP = 1e-6
 # ... plus this rounding, as a share of the mean eigenvalue of the form.
 _ROUNDING = 1e-11
 
-# Factor by which the weight of t in the barrier method grows after a short Newton step. The first
-# weight is the square of the factor.
+# In the barrier method, the weight of t is multiplied by this factor after a short Newton step. The
+# first weight is the square of the factor.
 _WEIGHT_GROWTH = 10.0
-# The iteration ends if t is this close to its minimum, as a share of the mean eigenvalue of the
+# The iteration ends if t is this near to its minimum, as a share of the mean eigenvalue of the
 # form.
 _CLOSE = 1e-12
 
@@ -62,8 +63,8 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
     eigenvalue = _maximise_smallest_eigenvalue(
         M / scale, enough=-0.25 * tolerance
     )
-    # |x|^2 is 4 for every rotation. So the lower bound is below the minimum by at most 4 times a
-    # negative eigenvalue.
+    # Every rotation has |x|^2 = 4. So the lower bound is at most 4 times a negative eigenvalue
+    # below the minimum.
     gap = 4.0 * max(-eigenvalue, 0.0)
     decrease = float(quadratic_form.decrease(Q, T_parent_child, Ts[0]))
     gap += max(decrease, 0.0) / scale
@@ -71,10 +72,10 @@ def is_global(Q: FloatArray, T_parent_child: FloatArray) -> bool:
 
 
 def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
-    """Maximise the smallest eigenvalue of Z over the free multipliers; return this eigenvalue.
+    """Maximise the smallest eigenvalue of Z over the free multipliers, and return it.
 
     The search ends early if the eigenvalue is at least ``enough``. A barrier method minimises t
-    such that ``Z + t I`` is positive definite on the directions perpendicular to the identity.
+    such that ``Z + t I`` is positive definite along all directions perpendicular to the identity.
     Along the identity, Z is zero by construction.
     """
     tables = _tables()
@@ -113,7 +114,7 @@ def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
 def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     """Return a Newton step (15,) of ``weight t - log det(Z + t I)``, and its Newton decrement.
 
-    The step stays inside the cone of positive definite matrices.
+    After the step, the matrix is still positive definite.
 
     Parameters
     ----------
@@ -129,8 +130,8 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
     hessian[np.diag_indices_from(hessian)] += 1e-14 * np.trace(hessian)
     step = -np.linalg.solve(hessian, gradient)
     decrement = float(np.sqrt(max(-gradient @ step, 0.0)))
-    # Z + t I becomes singular after the fraction 1 / decay of the step (decay > 0). Stop before,
-    # but take at least the damped step, which always stays inside the cone.
+    # After the fraction 1 / decay of the step (decay > 0), Z + t I becomes singular. Stop before,
+    # but take at least the damped step, which always keeps the matrix positive definite.
     decay = -np.linalg.eigvals(np.tensordot(step, solved, 1)).real.min()
     inside = 0.9 / decay if decay > 0 else 1.0
     damped = 1.0 / (1.0 + decrement)
@@ -138,7 +139,7 @@ def _newton_step(solved: FloatArray, weight: float) -> tuple[FloatArray, float]:
 
 
 class _Tables(NamedTuple):
-    """Constants of the proof, which depend only on the equations of rotations.
+    """Constants of the proof. They depend only on the equations of rotations.
 
     Attributes
     ----------
@@ -151,7 +152,7 @@ class _Tables(NamedTuple):
     stationary : (21, 10) array
         Factors that map ``M x`` to negative multipliers with ``Z x = 0`` at the identity.
     free : (14, 10, 10) array
-        Combinations of the equations whose multipliers are free: they do not change ``Z x``.
+        Combinations of the equations with free multipliers: they do not change ``Z x``.
     """
 
     identity: FloatArray

@@ -11,13 +11,13 @@ many local minima, so it follows a search for a good start:
    spatial perception*, RA-L 2020). The iteration starts from the minimum over all pairs, with soft
    weights that become sharper in each round.
 2. Rivals: minima over random subsets of the inliers, and over small random subsets of all pairs. As
-   in FAST-LTS (Rousseeuw, Van Driessen, *Computing LTS regression for large data sets*, 2006), many
-   rivals are started, and only the most promising ones are iterated to the end. A rival from the
-   inliers replaces the solution if its objective is smaller. A rival from all pairs may be far
-   away, and its objective must be clearly smaller: of distant minima of nearly the same height, the
-   one of graduated non-convexity is more reliable. A new solution gets new rivals.
+  in FAST-LTS (Rousseeuw, Van Driessen, *Computing LTS regression for large data sets*, 2006), many
+  rivals are started, and only the most promising rivals are iterated to the end. A rival from the
+  inliers replaces the solution if its objective is smaller. A rival from all pairs may be far away,
+  so its objective must be clearly smaller: among distant minima of nearly equal objective, the
+  minimum of graduated non-convexity is more reliable. A new solution gets new rivals.
 
-If there are many pairs, only an even sample is searched; then the solution is refined on all pairs.
+If there are many pairs, the search uses an even sample; then the solution is refined on all pairs.
 The random subsets have a fixed seed: the same pairs in the same order yield the same solution.
 """
 
@@ -38,9 +38,9 @@ _MAX_SEARCHED = 512
 # Number of Gauss-Newton steps to the minimum over all pairs, from which graduated non-convexity
 # starts.
 _STEPS_OVER_ALL = 4
-# Factor by which the sharpness (mu of Yang et al.) grows from round to round.
+# Factor of the sharpness (mu of Yang et al.) from round to round.
 _SHARPENING = 2.5
-# Sharpness at which the rounds end: the weights are almost 0 or 1.
+# The rounds end at this sharpness: the weights are then almost 0 or 1.
 _MAX_SHARPNESS = 30.0
 
 # Shares of the inliers in the random subsets of inliers.
@@ -48,30 +48,30 @@ _INLIER_SHARES = (0.2, 0.5)
 # Sizes of the random subsets of all pairs. Small subsets are often free of outliers, large ones
 # average noise.
 _SUBSET_SIZES = (4, 8, 16, 32)
-# Number of rivals that are started from each kind of subset, times the number of pairs: about 50
-# rivals for 100 pairs.
+# Number of rivals from each kind of subset, times the number of pairs: about 50 rivals for 100
+# pairs.
 _RIVALS_TIMES_PAIRS = 5000
 # Number of rounds before the most promising rivals are chosen.
 _FIRST_ROUNDS = 3
-# Number of the most promising rivals from each kind of subset, which are iterated to the end.
+# Number of the most promising rivals from each kind of subset. Only these are iterated to the end.
 _N_PROMISING = 3
 # Largest number of times that rivals are started.
 _MAX_GENERATIONS = 3
 
 # A rival from a subset of all pairs replaces the solution if its objective is below this share of
-# the objective of the solution.
+# the solution's objective.
 _CLEARLY_SMALLER = 0.99
 # The search ends if new rivals lower the objective by less than this share.
 _MIN_GAIN_OF_RIVALS = 1e-6
 
-# Largest number of rounds of an iteration, each with new weights and a new X.
+# Largest number of rounds in an iteration, each with new weights and a new X.
 _MAX_ROUNDS = 100
 # In the search, an iteration ends if a round lowers the objective by less than this share.
 _SEARCH_TOLERANCE = 1e-4
 # The refinement on all pairs ends if a round lowers the objective by less than this share.
 _TOLERANCE = 1e-9
 
-# Cost of a pair that is left out: finite, but larger than any threshold.
+# Cost of an omitted pair: finite, but larger than any threshold.
 _COST_OF_LEFT_OUT = 1e100
 
 
@@ -111,8 +111,8 @@ def _refined(
 ) -> Solution:
     """Improve X and the weights alternately on all pairs, from a start T (4, 4).
 
-    ``floor`` is d. The costs are computed from the coefficients of the pairs, which lose fewer
-    digits than their quadratic forms.
+    ``floor`` is d. The costs are computed from the coefficients of the pairs, which have more
+    digits than the quadratic forms.
     """
     coefficients = quadratic_form.coefficients(pairs)
     weights, objective = truncate(
@@ -122,7 +122,7 @@ def _refined(
     converged = False
     for _ in range(_MAX_ROUNDS):
         T_new = quadratic_form.gauss_newton_step(Q, T[None])[0]
-        # If the form predicts no decrease, the costs of the pairs need not be computed.
+        # If the form predicts no decrease, the costs of the pairs are not needed.
         converged = bool(
             quadratic_form.decrease(Q, T, T_new) < _TOLERANCE * objective
         )
@@ -151,7 +151,7 @@ def solve_without(
     threshold: float,
     min_inlier_fraction: float,
 ) -> FloatArray:
-    """Solve B times, each time without some of the pairs, for resampling.
+    """Solve B times, each time without some pairs, for resampling.
 
     The iterations start from the solution with all pairs. Other pairs may become inliers.
 
@@ -162,7 +162,7 @@ def solve_without(
     solution : Solution
         Solution with all K pairs.
     left_out : (B, K) bool array
-        Pairs that are left out of each solution.
+        Pairs that are omitted in each solution.
 
     Returns
     -------
@@ -188,7 +188,7 @@ def truncate(
     threshold : float
         c, in the unit of the costs.
     floor : float
-        d: smallest sum of the weights. It may be fractional: if fewer pairs are below c, the pairs
+        d: smallest sum of the weights. It may be fractional. If fewer pairs are below c, the pairs
         with the largest of the d smallest costs share the remainder.
 
     Returns
@@ -204,7 +204,7 @@ def truncate(
     if too_few.any():
         last = math.ceil(floor) - 1
         largest = np.partition(costs, last, axis=-1)[..., last, None]
-        # If there are enough pairs below c, they include the d smallest costs: nothing changes.
+        # If enough pairs are below c, they include the d smallest costs, and nothing changes.
         is_inlier |= costs <= largest
         weights = is_inlier.astype(float)
         excess = too_few * (is_inlier.sum(axis=-1) - floor)
@@ -242,7 +242,7 @@ class _Search:
     ) -> FloatArray:
         """Return the costs (S, K) of all pairs at each transform (S, 4, 4).
 
-        Pairs in ``left_out`` (S, K) have a very large cost.
+        Pairs in ``left_out`` (S, K) get a very large cost.
         """
         costs: FloatArray = quadratic_form.monomials(Ts) @ self.condensed.T
         if left_out is not None:
@@ -250,12 +250,12 @@ class _Search:
         return costs
 
     def refit(self, weights: FloatArray, Ts: FloatArray) -> FloatArray:
-        """Take a Gauss-Newton step from each transform (S, 4, 4) with its weights (S, K)."""
+        """Take a Gauss-Newton step from each transform (S, 4, 4), with weights (S, K)."""
         forms = quadratic_form.expand(weights @ self.condensed)
         return quadratic_form.gauss_newton_step(forms, Ts)
 
     def best(self, pairs: MotionPairs) -> FloatArray:
-        """Return the solution (4, 4) of graduated non-convexity, or a better rival.
+        """Return the solution (4, 4) of graduated non-convexity, or a rival that is better.
 
         ``pairs`` are the motion pairs of the forms.
         """
@@ -274,7 +274,8 @@ class _Search:
         for _ in range(_MAX_GENERATIONS):
             rivals, objectives = self.settle(self._rivals(best, random))
             before = objective
-            # The first rivals come from subsets of the inliers, the others from subsets of all.
+            # The first rivals come from subsets of the inliers, the other rivals from subsets of
+            # all pairs.
             for first, share in ((0, 1.0), (_N_PROMISING, _CLEARLY_SMALLER)):
                 rival = first + int(
                     np.argmin(objectives[first : first + _N_PROMISING])
@@ -333,7 +334,7 @@ class _Search:
                 self.threshold, np.partition(costs, last)[:, last]
             )
             if not sharpness.any():
-                # First round: the weights of all pairs are above zero.
+                # In the first round, the weights of all pairs are above zero.
                 largest = costs.max(axis=1)
                 sharpness = truncation / np.maximum(
                     2 * largest - truncation, truncation
@@ -362,7 +363,7 @@ class _Search:
         tolerance : float
             The iteration ends if no objective decreases by a larger share.
         left_out : (S, K) bool array, optional
-            Pairs that are left out for each start.
+            Pairs that are omitted for each start.
 
         Returns
         -------
@@ -375,7 +376,7 @@ class _Search:
             self.costs(Ts, left_out), self.threshold, self.floor
         )
         Ts = Ts.copy()
-        # Indices of the starts whose objective still decreases. The other starts are finished.
+        # Indices of the starts whose objective still decreases.
         active = np.arange(len(Ts))
         for _ in range(_MAX_ROUNDS):
             Ts_new = self.refit(weights, Ts[active])

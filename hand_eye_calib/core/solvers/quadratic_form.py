@@ -1,17 +1,17 @@
-"""The cost of a motion pair as a fixed quadratic form, and its minimum over SE(3).
+"""Cost of a motion pair as a fixed quadratic form, and the minimum of the form over SE(3).
 
 ``A X - X B`` is linear in the thirteen variables ``x = (vec R, t, 1)`` (vec is row-major). So the
 cost of pair k is a quadratic form with a constant symmetric 13 x 13 matrix,
 
     e_k(X) = | A X - X B |_F^2  (top three rows)  =  x' Q_k x,
 
-and every weighted sum of costs is such a form. For any number of pairs, the minimum of the sum
-takes a Newton iteration in three variables.
+and every weighted sum of costs is such a form. For any number of pairs, a Newton iteration in three
+variables finds the minimum of the sum.
 
-The residual is also linear in the pair: it is ``(A - I) X - X (B - I)``. A pair enters with 24
-coefficients u, the elements of ``A - I`` and ``B - I``. So residuals, forms and sums of forms are
-products of u with a constant array. The identity is subtracted first, because this keeps the digits
-of small motions.
+The residual is also linear in the pair: it is ``(A - I) X - X (B - I)``. The 24 coefficients u of a
+pair are the elements of ``A - I`` and ``B - I``. So residuals, forms and sums of forms are products
+of u with a constant array. Without the subtraction of the identity, small motions would lose
+digits.
 """
 
 import numpy as np
@@ -24,13 +24,13 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 # Number of variables in x.
 DIMENSION = 13
 
-# Number of pairs that are condensed at once. Their arrays fit into the cache of the processor.
+# Number of pairs that are condensed together. Their arrays fit into the cache of the processor.
 _BLOCK = 128
-# Number of pairs that are summed at once. Their arrays are smaller.
+# Number of pairs that are summed together. Their arrays are smaller.
 _SUMMED_BLOCK = 1024
 
-# Eigenvalues of the translation block of a form count as zero below this share of the largest one:
-# they are rounding.
+# Eigenvalues of the translation block below this share of the largest one are rounding, and count
+# as zero.
 _RANK_TOLERANCE = 1e-10
 
 # Largest number of steps of a Newton iteration. A well-posed form needs about ten.
@@ -46,7 +46,7 @@ _X_IN_T = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11, 15])
 
 # Rows and columns of the upper triangle of a form.
 _ROWS, _COLUMNS = np.triu_indices(DIMENSION)
-# How often each element of the triangle is in the form: twice off the diagonal.
+# Number of times that each element of the triangle is in the form: twice off the diagonal.
 _MULTIPLICITY = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 # Index in the triangle of each element of a form.
 _TRIANGLE = np.empty((DIMENSION, DIMENSION), dtype=int)
@@ -100,7 +100,7 @@ _TANGENTS = _tangent_table()
 def condense(pairs: MotionPairs) -> FloatArray:
     """Return the upper triangles (K, 91) of the forms Q_k of all K pairs.
 
-    Their elements are in the order of ``numpy.triu_indices(13)``. So the costs of the pairs are
+    The elements have the order of ``numpy.triu_indices(13)``, so the costs of the pairs are
     ``condensed @ monomials(X)``.
     """
     condensed = np.empty((len(pairs), len(_ROWS)))
@@ -136,8 +136,8 @@ def median_costs(
 ) -> FloatArray:
     """Return the medians (S,) of the costs of all pairs, at each X and scale of the child.
 
-    The costs are in the smaller unit of length. Otherwise a scale of zero would have the smallest
-    cost.
+    The costs are in the smaller unit of length. Otherwise, a scale of zero would always have the
+    smallest cost.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def median_costs(
 def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the sum (13, 13) of the forms of K pairs, with weights (K,).
 
-    The sum is computed from the coefficients (K, 24), in less time than a sum of forms.
+    The sum is computed from the coefficients (K, 24), which is faster than a sum of forms.
     """
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
@@ -185,7 +185,7 @@ def decrease(
 def monomials(T_parent_child: FloatArray) -> FloatArray:
     """Return the products ``x_i x_j`` (..., 91), i <= j, of transforms X (..., 4, 4).
 
-    Products of two different variables are doubled, because the triangle contains them once.
+    A product of two different variables is doubled, because the triangle contains it once.
     """
     entries = T_parent_child.reshape((*T_parent_child.shape[:-2], 16))
     first = entries.take(_X_IN_T[_ROWS], axis=-1)
@@ -235,7 +235,7 @@ def minimise(
         R_new = R @ se3.rotation_exp(step)
         value_new, gradient_new, hessian_new = _derivatives(forms, R_new)
         better = (value_new < value) & ~converged
-        # Near the minimum, a step changes the value by less than rounding. It is the last step.
+        # Near the minimum, a step changes the value by less than rounding. This step is the last.
         rounding = 1e-15 * (np.abs(value) + np.abs(constant))
         stalled = ~better & (0.5 * curvature * length**2 <= rounding)
         converged |= (length < _STEP_TOLERANCE) | stalled
@@ -296,7 +296,7 @@ def _newton_step(
         Largest absolute curvature of each form.
     """
     values, axes = np.linalg.eigh(hessian)
-    # Absolute values make the step a descent direction also along negative curvature.
+    # With absolute values, the step is a descent direction also along negative curvature.
     curvatures = np.abs(values)
     largest = curvatures.max(axis=1)
     # A curvature below rounding would make an arbitrarily long step.
@@ -315,7 +315,7 @@ def _newton_step(
 def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     """Take one Gauss-Newton step for each form from its own transform.
 
-    It takes less time than a step of :func:`minimise`, but loses digits. It is for searches whose
+    The step is faster than a step of :func:`minimise`, but loses digits. It is for searches whose
     result is refined afterwards.
 
     Parameters
@@ -332,15 +332,15 @@ def gauss_newton_step(Q: FloatArray, Ts_parent_child: FloatArray) -> FloatArray:
     """
     n_forms = len(Ts_parent_child)
     entries = Ts_parent_child.reshape(n_forms, 16)
-    # Derivatives of x along the six tangents, then x itself: seven vectors, linear in X.
+    # Derivatives of x along the six tangents, then x itself. These seven vectors are linear in X.
     tangents = (entries @ _TANGENTS).reshape(n_forms, 7, DIMENSION)
     normal = tangents @ Q @ tangents.transpose(0, 2, 1)
-    # The damping keeps X along directions that the pairs do not determine, and is too small to slow
-    # down the other directions. Every eighth of the 49 elements is on the diagonal.
+    # The damping keeps X constant along directions that the pairs do not determine. It is too small
+    # to slow down other directions. Every eighth of the 49 elements is on the diagonal.
     diagonal = normal.reshape(n_forms, 49)[:, :48:8]
     diagonal += 1e-12 * diagonal.sum(axis=1, keepdims=True) + TINY
     step = np.linalg.solve(normal[:, :6, :6], -normal[:, :6, 6:])
-    # Cayley's map equals the exponential up to second order, and takes less time.
+    # Cayley's map equals the exponential to second order, and is faster.
     twist = (step[:, :, 0] @ _TWISTS).reshape(n_forms, 4, 4)
     squared_angles = (step[:, 3:] ** 2).sum(axis=1, keepdims=True)
     shrink = 1 / (1 + 0.25 * squared_angles)

@@ -30,11 +30,11 @@ class _Solver(NamedTuple):
     solve : callable
         ``solve(pairs)``; for dnlo ``solve(pairs, threshold, min_inlier_fraction)``.
     solve_near : callable or None
-        ``solve_near(pairs, T_start)`` saves time by a start from a transform (4, 4) near the
-        solution. None if the method has no start.
+        Function ``solve_near(pairs, T_start)`` that starts from a transform (4, 4) near the
+        solution, which saves time. None if the method needs no start.
     solve_best_stride : callable or None
-        ``solve_best_stride(Ts_pw_p, Ts_cw_c)`` chooses the motions for the reference ``auto``, and
-        solves them. None if the adaptive estimator chooses the reference.
+        Function ``solve_best_stride(Ts_pw_p, Ts_cw_c)`` that chooses the motions for the reference
+        ``auto``, and solves them. None if the adaptive estimator chooses the reference.
     """
 
     solve: Callable[..., Solution]
@@ -67,14 +67,14 @@ class Method:
     threshold : float
         c of eq. (5), in m^2; only for dnlo.
     min_inlier_fraction : float
-        d of eq. (5) over the number of pairs; only for dnlo.
+        d of eq. (5), divided by the number of pairs; only for dnlo.
     backend : str
         "fast", or "ipopt" for dnl and dnlo.
 
     Raises
     ------
     ConfigError
-        If the method is unknown or does not have the backend.
+        If the method is unknown or lacks the backend.
     """
 
     name: str
@@ -95,7 +95,7 @@ class Method:
     ) -> Callable[[FloatArray, FloatArray], robust.Stride] | None:
         """Function ``(Ts_pw_p, Ts_cw_c)`` that chooses the motions for the reference ``auto``.
 
-        None if the method has no such function.
+        The value is None if the method has no such function.
         """
         return _SOLVERS[self.name].solve_best_stride
 
@@ -113,7 +113,7 @@ class Method:
             )
         solve = _SOLVERS[self.name].solve
         if self.backend == "ipopt":
-            # The import takes a second, so it is made only here.
+            # The import takes a second, so it is only here.
             from hand_eye_calib.core.solvers import ipopt
 
             solve = ipopt.solve_dnl if self.name == "dnl" else ipopt.solve_dnlo
@@ -138,7 +138,7 @@ class Method:
     def solve_without(
         self, pairs: MotionPairs, solution: Solution, left_out: BoolArray
     ) -> FloatArray:
-        """Solve B times, each time without some of the pairs, for resampling.
+        """Solve B times, each time without some pairs, for resampling.
 
         Parameters
         ----------
@@ -147,7 +147,7 @@ class Method:
         solution : Solution
             Solution with all pairs.
         left_out : (B, K) bool array
-            Pairs that are left out of each solution.
+            Pairs that are omitted in each solution.
 
         Returns
         -------
@@ -155,7 +155,7 @@ class Method:
             Transforms X.
         """
         if self.name == "dnlo":
-            # Iterations from the solution take less time than a search for it.
+            # Iterations from the solution are faster than a new search.
             return dnlo.solve_without(
                 pairs,
                 solution,

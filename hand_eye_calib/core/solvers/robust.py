@@ -1,12 +1,12 @@
 """Robust least squares on motion pairs, without a noise model.
 
-Model: the residual of motion A_i of the parent and motion B_i of the child is
+Model: the residual of a motion pair (motion A_i of the parent, motion B_i of the child) is
 
     e_i(X) = (translation, rotation vector) of B_i^-1 X^-1 A_i X.
 
 Residuals have heavy tails. All translations have one unknown standard deviation, and all rotations
-another; both are estimated from medians of the residuals. X minimises the sum of Cauchy costs of
-translations and rotations. Motions that overlap are not independent, so the covariance is computed
+have another one; medians of the residuals estimate both. X minimises the sum of Cauchy costs of
+translations and rotations. Overlapping motions are not independent, so the covariance is computed
 from sums over neighbouring pairs: W. K. Newey, K. D. West, *A simple, positive semi-definite,
 heteroskedasticity and autocorrelation consistent covariance matrix*, Econometrica 55, 1987.
 """
@@ -28,17 +28,17 @@ from hand_eye_calib.core.solvers.all_pairs import (
     translation_equations,
 )
 
-# Residual, in standard deviations, at which a Cauchy weight is a half: 95 % efficiency for normal
-# errors (Holland and Welsch 1977, table 1).
+# A residual of this number of standard deviations has half of the full Cauchy weight: 95 %
+# efficiency for normal errors (Holland and Welsch 1977, table 1).
 _CAUCHY_UNIT = 2.385
 
 # Largest number of Gauss-Newton steps.
 _MAX_STEPS = 100
-# The standard deviations of the residuals are fixed after this number of steps, because medians may
+# After this number of steps, the standard deviations of the residuals stay fixed: medians may
 # alternate between two residuals.
 _FREE_SCALE_STEPS = 50
 
-# The iteration ends by default if a step is shorter than this, in standard deviations of X.
+# By default, the iteration ends if a step is shorter than this, in standard deviations of X.
 _STEP_TOLERANCE = 1e-5
 
 # Number of start angles about the common axis of all motions. On flat ground, rotations do not
@@ -50,20 +50,21 @@ _MIN_SCALE = 1e-8
 
 # Assumed correlation time of errors, as a share of the recording.
 _CORRELATED_SHARE = 1.0 / 20.0
-# Smallest assumed correlation time, in motions: motions that overlap have common errors.
+# Smallest assumed correlation time, in motions. Overlapping motions have common errors.
 _CORRELATED_MOTIONS = 2
 
-# Strides that are tried. A stride is the number of poses from the start to the end of a motion.
+# Strides that are tried. A stride is the number of poses between the start and the end of a motion.
 _STRIDES = (1, 2, 5, 10, 20, 50)
 
-# Number of motions that start within one stride. More motions would overlap by more than four
-# fifths and add little information.
+# Number of motions that start within one stride. Further motions would overlap by more than four
+# fifths, and add little information.
 _MOTIONS_PER_STRIDE = 5
 
-# Largest number of motions of one stride. More motions take time and hardly change the covariance.
+# Largest number of motions per stride. Further motions take time, and hardly change the covariance.
 _MAX_MOTIONS = 2000
 
-# Strides above 1 are skipped if fewer motions than this fit into the recording one after the other.
+# A stride above 1 is skipped if less than this number of successive motions fits into the
+# recording.
 _MIN_MOTIONS = 10
 
 
@@ -95,15 +96,15 @@ def solve(
     ----------
     pairs : MotionPairs
     T_start : (4, 4) array, optional
-        Transform near the solution. By default, it is computed from the pairs.
+        Transform near the solution. By default it is computed from the pairs.
     tolerance : float
         The iteration ends if a step is shorter than this, in standard deviations of X.
 
     Returns
     -------
     RobustSolution
-        ``objective`` is the sum of the Cauchy costs of translations and rotations, each in units of
-        its standard deviation. ``weights`` are the smaller of both weights of each pair.
+        ``objective`` is the sum of the Cauchy costs of translations and rotations, in units of
+        their standard deviations. ``weights`` has the smaller of both weights of each pair.
     """
     T_parent_child = _start(pairs) if T_start is None else T_start
     scales = np.full(2, _MIN_SCALE)
@@ -141,8 +142,8 @@ class Stride(NamedTuple):
     reference : str
         Reference of the motions: "B5" for motions over five poses.
     pairs : MotionPairs
-        Motion pairs of the reference: every k-th pair if neighbours overlap much, or if there are
-        many pairs.
+        Motion pairs of the reference. If neighbours overlap much, or if there are many pairs, only
+        every k-th pair.
     solution : RobustSolution
     """
 
@@ -165,7 +166,7 @@ def solve_strides(
         Synchronised poses of both sensors, in order of time.
     T_start : (4, 4) array, optional
     tolerance : float
-        ``T_start`` and ``tolerance`` are those of :func:`solve`.
+        See :func:`solve`.
 
     Returns
     -------
@@ -205,17 +206,17 @@ def _components(
 ) -> tuple[_Component, _Component]:
     """Return residuals and their derivatives with respect to xi in ``X Exp(xi)``.
 
-    The first component are the translations (m), the second the rotation vectors (rad).
+    The first component has the translations (m), the second the rotation vectors (rad).
     """
-    # Motion X^-1 A X of the child, predicted from the motion of the parent.
-    # One product of two-dimensional matrices takes less time than many small ones.
+    # Motion X^-1 A X of the child, predicted from the parent's motion. A single product of
+    # two-dimensional matrices is faster than many small products.
     moved = (pairs.Ts_parenti_parentj.reshape(-1, 4) @ T_parent_child).reshape(
         -1, 4, 4
     )
     predicted = se3.inverse(T_parent_child) @ moved
     errors = se3.inverse(pairs.Ts_childi_childj) @ predicted
     # For a predicted motion Y, Exp(-xi) Y Exp(xi) = Y Exp(xi - Ad(Y^-1) xi) to first order. The
-    # errors are near the identity, so that the Jacobians neglect the rotation of the errors.
+    # errors are near the identity, so the Jacobians neglect their rotation.
     jacobians = np.eye(6) - se3.adjoint(se3.inverse(predicted))
     rotation_vectors = se3.rotation_log(se3.rotation_of(errors))
     translation = _Component(se3.translation_of(errors), jacobians[:, :3])
@@ -273,10 +274,10 @@ def _covariance(
 ) -> FloatArray:
     """Return the covariance (6, 6) from the weighted Hessian and the scores (2, K, 6) of pairs.
 
-    It allows for errors that are correlated over a share of the recording.
+    The covariance includes errors that are correlated over a share of the recording.
     """
-    # The weight of a pair decreases as its residual grows. The weighted Hessian does not contain
-    # this term of the second derivative.
+    # The weight of a pair decreases with its residual. The weighted Hessian lacks this term of the
+    # second derivative.
     curvature = (
         2.0 / 3.0 / _CAUCHY_UNIT**2 * np.einsum("pki,pkj->ij", scores, scores)
     )
@@ -288,8 +289,8 @@ def _covariance(
     )
     window = round(n_correlated_poses * len(pairs) / n_poses)
     window = min(max(window, 1), len(pairs) // 2 + 1)
-    # Residuals are smaller than errors, because the six unknowns fit some of the errors. The factor
-    # n / (n - 6) corrects this, for n motions that do not overlap.
+    # Residuals are smaller than errors, because the six unknowns fit a part of the errors. For n
+    # motions without overlap, the factor n / (n - 6) corrects this.
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
     return (
@@ -313,8 +314,8 @@ def _sandwich(
 def _inverse(hessian: FloatArray) -> FloatArray:
     """Return the pseudo-inverse (6, 6) of a Hessian.
 
-    The rank is determined after translation and rotation were scaled to the same size, because they
-    may differ by many powers of ten.
+    The rank is determined after translation and rotation were scaled to equal size: they may differ
+    by many powers of ten.
     """
     units = _units(hessian)
     balanced = np.linalg.pinv(
@@ -335,7 +336,8 @@ def _null_space(hessian: FloatArray) -> FloatArray:
 def _units(hessian: FloatArray) -> FloatArray:
     """Return the scales (6,) of translation and of rotation in a Hessian (6, 6).
 
-    A scale is the root of the largest diagonal element of its component; 1 if this is zero.
+    A scale is the square root of the largest diagonal element of the translation or of the
+    rotation; 1 if this element is zero.
     """
     largest = np.diag(hessian).reshape(2, 3).max(axis=1)
     roots = np.sqrt(largest)
@@ -357,12 +359,13 @@ def _start(pairs: MotionPairs) -> FloatArray:
     """Return a transform (4, 4) near the solution.
 
     The rotation aligns the rotation vectors of both sensors. If all motions rotate about one axis,
-    the angle about this axis remains unknown. So several angles are tried, each with its
-    translation by least squares.
+    the angle about this axis is unknown. Several angles are then tried, with their least squares
+    translations.
     """
     vectors_parent = se3.rotation_log(se3.rotation_of(pairs.Ts_parenti_parentj))
     vectors_child = se3.rotation_log(se3.rotation_of(pairs.Ts_childi_childj))
-    # Both motions of a pair rotate by the same angle, for any X. Other pairs get small weights.
+    # For any X, both motions of a pair rotate by the same angle. Pairs with different angles get
+    # small weights.
     differences = np.linalg.norm(vectors_parent, axis=1) - np.linalg.norm(
         vectors_child, axis=1
     )
@@ -380,8 +383,8 @@ def _start(pairs: MotionPairs) -> FloatArray:
         misfit_m = _median_length(slopes @ translation - targets)
         misfit_rad = _median_length(vectors_parent - vectors_child @ rotation.T)
         starts.append(se3.from_rotation_translation(rotation, translation))
-        # The misfit of rotation, as a share of the rotation, is converted to a share of the
-        # translation in m.
+        # Convert the misfit of the rotation to m: its share of the rotation, times the median
+        # translation.
         misfits_m.append(
             misfit_m + misfit_rad / angle_rad * _median_length(targets)
         )

@@ -9,17 +9,17 @@ With ``z = tan(w/2) k`` for the rotation by w about k, Cayley's formula ``R = (I
     f = [k_A + k_B] z + k_A - k_B                              (rotation axes: k_A = R k_B)
     g = (I - [z]) ((R_A - I) t + t_A) - (I + [z]) t_B          (translations)
 
-Both residuals f and g are linear in the sixteen products of (1, z) with (1, t). So the pairs are
-condensed once, by a QR decomposition, and an iteration takes the same time for any number of pairs.
+Both residuals f and g are linear in the sixteen products of (1, z) with (1, t). A QR decomposition
+condenses the pairs once. So an iteration takes equal time for any number of pairs.
 
-The axes have unit length even for small angles, so that noisy rotations bias the solution. A large
-rotation of X biases it, too, because g grows with this rotation. A rotation of X by pi has no
+The axes have unit length even for small angles, so noisy rotations bias the solution. A large
+rotation of X also biases it, because g grows with this rotation. A rotation of X by pi has no
 finite z.
 
 The iteration starts from the identity. It may converge to a false minimum if X rotates by more than
-about 1.8 rad. In the published results this happens in 33 rows of one simulated trajectory, whose X
-rotates by 3.13 rad; three of these rows are noise-free. Such a solution is returned as published,
-but ``converged`` is False if the cost is lower near the solution of Park.
+about 1.8 rad. In the published results, this happens in 33 rows of one simulated trajectory, whose
+X rotates by 3.13 rad; three of these rows are without noise. Such a solution is returned as
+published, but ``converged`` is False if the cost near the solution of Park is lower.
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ _MAX_ITERATIONS = 500
 # the authors' program.
 _STEP_TOLERANCE = 1e-8
 
-# A minimum is lower than another one if its cost is smaller by more than this share ...
+# A minimum is lower than another minimum if its cost is smaller by more than this share ...
 _MIN_DIFFERENCE = 1e-6
 # ... and by more than this rounding of the residuals, as a share of the data.
 _ROUNDING = 1e-12
@@ -52,7 +52,7 @@ def solve(pairs: MotionPairs) -> Solution:
     parameters, objective, settled = _gauss_newton(M, np.zeros(6))
     near_park = _parameters(all_pairs.solve_park(pairs).T_parent_child)
     _, objective_near_park, _ = _gauss_newton(M, near_park)
-    # The cost at a false minimum is higher than that of the minimum near the solution of Park.
+    # The cost at a false minimum exceeds the cost at the minimum near the solution of Park.
     rounding = _ROUNDING**2 * float((M**2).sum())
     is_lowest = (
         objective <= objective_near_park / (1 - _MIN_DIFFERENCE) + rounding
@@ -108,9 +108,9 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     # Factors of (1, z) in f.
     by_z = se3.skew(k_A + k_B)
     f = np.concatenate([(k_A - k_B)[:, :, None], by_z], axis=2)
-    # Coefficients (K, 3, i, j) of z_i t_j in g, with z_0 = t_0 = 1:
-    # g = (R_A - I) t + t_A - t_B - [z] ((R_A - I) t + t_A + t_B).
-    # The slices i = 1, 2, 3 first contain the bracket; the einsum multiplies it by -[z].
+    # Coefficients (K, 3, i, j) of z_i t_j in g, with z_0 = t_0 = 1: g = (R_A - I) t + t_A - t_B -
+    # [z] ((R_A - I) t + t_A + t_B). The slices i = 1, 2, 3 first contain the bracket; the einsum
+    # then multiplies it by -[z].
     chords = se3.rotation_of(A) - np.eye(3)
     g = np.zeros((len(pairs), 3, 4, 4))
     g[..., 1:] = chords[:, :, None]
@@ -120,7 +120,7 @@ def _condense(pairs: MotionPairs) -> FloatArray:
     g[:, :, 1:] = -np.einsum("zij,njzt->nizt", se3.skew(np.eye(3)), brackets)
     root_f = np.linalg.qr(f.reshape(-1, 4), mode="r")
     root_g = np.linalg.qr(g.reshape(-1, 16), mode="r")
-    # f does not contain t: its coefficients are those of the products with t_0 = 1.
+    # f does not contain t. Its coefficients belong to the products with t_0 = 1.
     root_f_of_products = np.kron(root_f, [1.0, 0.0, 0.0, 0.0])
     return np.concatenate([root_f_of_products, root_g])
 
