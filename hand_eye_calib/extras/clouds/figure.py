@@ -34,15 +34,15 @@ from hand_eye_calib.offline.report.style import (
 
 # Half the thickness (m) of the slice of the view from the side.
 _HALF_SLICE_M = 1.5
-# Points of the view from above are higher than the ground by this (m). Rings on the ground would
-# hide the walls.
+# The view from above contains points that are higher above the ground than this (m). Rings on the
+# ground would hide the walls.
 _ABOVE_GROUND_M = 0.5
-# Share of the points that may be outside a view, on either side of each axis.
+# Share of the points that may be outside a view, at each end of each axis.
 _OUTSIDE = 0.01
-# Number of cells along an axis of a view. A view draws one dot in each cell.
+# Number of cells along an axis of a view. Each cell has at most one dot.
 _CELLS = 250
-# Smallest share of the child's points near surfaces of the parent. With a smaller share, the clouds
-# hardly overlap, and a distance between them has no meaning.
+# Smallest share of the child's points near surfaces of the parent. With less, the clouds hardly
+# overlap, and their distance has no meaning.
 _MIN_SHARED = 0.05
 
 
@@ -74,7 +74,7 @@ def _title(calibration: Calibration) -> str:
 
 @page_style()
 def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
-    """Draw two views from above and two from the side; before is left, after is right."""
+    """Draw two views from above and two from the side: before at the left, after at the right."""
     figure, panels = make_panels(5.3, 2, 2, gap=0.12, height_ratios=(2.6, 1.0))
     has_installed = installed_transform(calibration) is not None
     titles = ("Before: as installed" if has_installed else "Before", "After")
@@ -117,7 +117,7 @@ def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
         lines.append(Line2D([], [], color=colour, label=plain_label(sensor)))
     caption = _caption(calibration, merged)
     drawn = as_drawn(figure, name, _title(calibration), caption, lines)
-    # A dot is a line without length: "M x y L x y" becomes the shorter "Mx yh0".
+    # A dot is a line of zero length: "M x y L x y" becomes the shorter "Mx yh0".
     svg = re.sub(r"M ([\d.-]+ [\d.-]+) \nL \1 \n?", r"M\1h0", drawn.svg)
     return replace(drawn, svg=svg)
 
@@ -125,20 +125,21 @@ def _drawn(calibration: Calibration, merged: MergedClouds, name: str) -> Drawn:
 def _with_equal_scales(
     panel_inches: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return wider limits (2,) of a view, with which both of its axes have one scale."""
+    """Return wider limits (2,) of a view, so that both of its axes have one scale."""
     half = float(np.max((high - low) / panel_inches)) * panel_inches / 2
     center = (low + high) / 2
     return center - half, center + half
 
 
 def _above_ground(merged: MergedClouds) -> tuple[BoolArray, BoolArray]:
-    """Return which points of parent and child, through the result, are above the ground.
+    """Return which points of parent and child (through the result) are above the ground.
 
-    All points are, if the axes of the picture are not upright or nothing is on the ground.
+    If the axes of the picture are not upright, or nothing is on the ground, all points count as
+    above.
     """
     heights = np.r_[merged.parent[:, 2], merged.after[:, 2]]
     bins = np.floor((heights - heights.min()) / _ABOVE_GROUND_M).astype(int)
-    # The ground has most points.
+    # The bin with most points is the ground.
     ground_m = np.median(heights[bins == np.bincount(bins).argmax()])
     is_above = heights > ground_m + _ABOVE_GROUND_M
     if not merged.is_upright or is_above.mean() < _MIN_SHARED:
@@ -169,7 +170,8 @@ def _draw_view(
         ylim=(low[axes[1]], high[axes[1]]),
     )
     cell_m = (high - low)[axes] / _CELLS
-    # Thin dots of the child on thick dots of the parent: both colours are visible on one wall.
+    # Thin dots of the child are drawn on thick dots of the parent, so that both colours are visible
+    # on one wall.
     looks = ((PARENT, 2.4), (CHILD, 1.1))
     for points, (colour, width) in zip(clouds, looks, strict=True):
         plane = points[:, axes]
@@ -184,7 +186,7 @@ def _draw_view(
 
 
 def _caption(calibration: Calibration, merged: MergedClouds) -> str:
-    """Return what to look for, and the distances of the clouds before and after."""
+    """Return a caption with what to look for, and the distances of the clouds before and after."""
     parent = calibration.parent_frame
     child = calibration.child_frame
     before = "as installed"

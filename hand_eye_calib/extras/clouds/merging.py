@@ -26,16 +26,16 @@ from hand_eye_calib.offline.report.evidence import upward_normal
 
 @dataclass(frozen=True)
 class Tuning:
-    """Constants of the merged clouds; all are choices."""
+    """Constants of the merged clouds. All of them are choices, not measured."""
 
     # Number of scans of each sensor.
     n_scans: int = 4
-    # Longest time (s) from the first scan to the last, because odometry drifts.
+    # Longest time (s) from the first scan to the last scan. It is short because odometry drifts.
     longest_s: float = 30.0
-    # Turn (rad) between these scans that is sufficient.
+    # Angle (rad) between these scans that is sufficient.
     sufficient_turn: float = np.pi / 2
-    # Time (s) between compared poses. Each scan is then moved by up to twice this time, to where
-    # the sensor turns most slowly.
+    # Time (s) between compared poses. Each scan is then shifted by up to twice this time, to the
+    # instant at which the sensor rotates most slowly.
     step_s: float = 0.5
     # Largest number of points of a scan, evenly drawn.
     max_points: int = 5_000
@@ -44,7 +44,7 @@ class Tuning:
     # A plane is fitted to this number of neighbours within this distance (m).
     n_neighbours: int = 12
     reach_m: float = 1.0
-    # Largest variance of a plane along its normal, as a share of the next variance.
+    # Largest variance of a plane along its normal, as a share of its next larger variance.
     max_flat: float = 0.1
 
 
@@ -86,7 +86,7 @@ class MergedClouds:
 def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
     """Merge the clouds of a recording; None unless both sensors have clouds in their frames.
 
-    Clouds without stamps among the poses of the parent are not used either.
+    Clouds are also not used if their stamps are outside the poses of the parent.
     """
     if not snapshot.bags or snapshot.config.measured != "poses":
         return None
@@ -138,7 +138,7 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
 
 
 def installed_transform(calibration: Calibration) -> FloatArray | None:
-    """Return the installed T_parent_child (4, 4); None if the result is not compared with one."""
+    """Return the installed T_parent_child (4, 4); None if the result has no comparison with it."""
     comparison = calibration.comparison
     if comparison is None or not comparison.values:
         return None
@@ -153,8 +153,8 @@ def distances_from_surfaces(
 ) -> FloatArray:
     """Return the distances (M,) of points (M, 3) from the planes through their neighbours, m.
 
-    ``surfaces`` (N, 3) are points of the surfaces. The distance of a point without a plane nearby
-    is NaN.
+    ``surfaces`` (N, 3) are points of the surfaces. A point without a plane nearby has the distance
+    NaN.
     """
     means, normals = _planes(surfaces, points)
     return np.abs(np.einsum("ni,ni->n", points - means, normals))
@@ -191,7 +191,7 @@ def _planes(
 
 
 def _instants(parent: Trajectory, child: Trajectory) -> IntArray:
-    """Return the stamps (ns) of the scans, between which the parent turns most in a short time.
+    """Return stamps (ns) of scans between which the parent rotates most in a short time.
 
     The child is on the parent's clock.
     """
@@ -237,7 +237,7 @@ def _angles(rotations: FloatArray, rotation: FloatArray) -> FloatArray:
 
 
 def _scans(bag: PoseBag, topic: str, stamps_ns: IntArray) -> _Cloud:
-    """Return the points of the scans of a topic that are nearest to some stamps (ns).
+    """Return the points of those scans of a topic that are nearest to the stamps (ns).
 
     Damaged scans are skipped. Only the parts of the bag near these stamps are read.
     """
@@ -255,7 +255,7 @@ def _scans(bag: PoseBag, topic: str, stamps_ns: IntArray) -> _Cloud:
 
 
 def _bag_delay(bag: PoseBag, topic: str) -> int:
-    """Return the bag time of the first message of a topic less its stamp (ns)."""
+    """Return the bag time of the first message of a topic minus its stamp (ns)."""
     run = next(bag.runs([topic]))
     message = next(run._replace(messages=run.messages[:1]).decoded())
     stamp_ns = ns_of(message.header.stamp) or 0
@@ -265,7 +265,7 @@ def _bag_delay(bag: PoseBag, topic: str) -> int:
 def _nearest(
     bag: PoseBag, topic: str, bag_ns: int, reach_ns: int
 ) -> Run | None:
-    """Return the message of a topic that is nearest to a bag time; None if none is in reach."""
+    """Return the message of a topic nearest to a bag time, or None if none is in reach."""
     nearest = None
     smallest_ns = reach_ns
     for run in bag.runs([topic], (bag_ns - reach_ns, bag_ns + reach_ns)):
@@ -326,8 +326,7 @@ def _axis_of_surfaces(
 ) -> FloatArray:
     """Return the principal axis (3,) of the normals of surfaces (N, 3).
 
-    Of the three principal axes, it is the one nearest to the direction. Without planes, it is any
-    axis of the world.
+    It is the principal axis nearest to the direction. Without planes, it is any axis of the world.
     """
     every = -(-len(surfaces) // TUNING.max_points)
     _, normals = _planes(surfaces, surfaces[::every])
@@ -343,9 +342,8 @@ def _axes_of_picture(
 ) -> tuple[FloatArray, bool]:
     """Return the transform (4, 4) from the parent's world to the picture.
 
-    The second value is whether z of the picture is the normal of the plane of motion. Otherwise it
-    is an axis of the surfaces (N, 3), near z of the parent: walls are parallel to it, or
-    perpendicular.
+    The second value is whether z of the picture is the normal of the plane of motion. If not, z is
+    an axis of the surfaces (N, 3) near z of the parent: walls are parallel or perpendicular to it.
     """
     T_world_parent = parent.at(np.array([stamp_ns]))[0]
     normal = upward_normal(parent.poses)

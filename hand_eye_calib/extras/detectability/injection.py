@@ -1,29 +1,29 @@
-"""Injection of errors into a recording, judged by the part of the recording that was not used.
+"""Injection of errors into a recording. The part of the recording that was not used judges them.
 
-Motions of about a second have residuals ``e = -J x + noise``. The unknowns x are the error xi of
-X in ``X exp(xi)``, an error of the time offset, and a relative error of the scale. The evidence
-``[H S]`` of each second adds (:mod:`hand_eye_calib.core.base.blocks`).
+Motions of about a second have residuals ``e = -J x + noise``. The unknowns x are the error xi of X
+in ``X exp(xi)``, an error of the time offset, and a relative error of the scale. The evidence ``[H
+S]`` of all seconds is added (:mod:`hand_eye_calib.core.base.blocks`).
 
-*Errors of the result.* The blocks are split at random into two halves. One half estimates x; the
-other half is the judge, with its own estimate. Their difference is d. An error of size a in an
-unknown changes the difference to ``d + a`` or ``d - a``. The judge contradicts the error if
+*Errors of the result.* The blocks are split at random into two halves. One half estimates x. The
+other half judges, with an estimate of its own. Their difference is d. An error of size a in an
+unknown changes the difference to ``d + a`` or ``d - a``. The error is contradicted if
 
     |d +- a| > 3 sqrt((2 s)^2 + allowance^2).
 
-s is the standard deviation of the whole recording, so the difference of two halves has 2 s. It is
-the larger of two: that of the block jackknife (H. Kuensch, *The jackknife and the bootstrap for
-general stationary observations*, 1989), the scatter that the blocks really have; and the measured
-part of the sigma of the result. A method of the paper may use the motion less well than the blocks
-do, and then its own sigma is larger. If the jackknife is much larger, the sigma is too small: the
-smallest error that is found in nine of ten trials also tests this sigma. A constant error of an
-odometry is the same in both halves; the allowance stands for it.
+s is the standard deviation for the whole recording, so the difference of two halves has 2 s. It is
+the larger of two values. The first is from the block jackknife (H. Kuensch, *The jackknife and the
+bootstrap for general stationary observations*, 1989): the actual scatter of the blocks. The second
+is the measured part of the sigma of the result, because a method of the paper may use the motion
+less well than the blocks. If the jackknife is much larger, the sigma is too small: the smallest
+error that is found in nine of ten trials also tests this sigma. A constant error of an odometry is
+equal in both halves; the allowance represents it.
 
 *Shifts of the mount.* The child's poses after a time in the middle are moved by ``exp(a u)``: a
 shift of size a along the unit vector u. The likelihood ratio of the stream checks
-(:mod:`hand_eye_calib.core.assessment.moved`) yields a first size from the evidence.
-Then shifts of this size are injected, and the stream check runs. The size grows until the check
-reports the shift. X is not estimated again. The injections take longer than the rest. Therefore
-they wait until a caller reads the sizes of the shifts.
+(:mod:`hand_eye_calib.core.assessment.moved`) leads to a first size. Shifts of this size are then
+injected, and the stream check is run. The size is increased until the check reports the shift. X is
+not estimated again. The injections take longer than all other steps, so they are made only when a
+caller reads the sizes of the shifts.
 """
 
 from dataclasses import replace
@@ -56,37 +56,39 @@ from hand_eye_calib.extras.detectability.record import (
     SizesAtFirstUse,
 )
 
-# Number of random splits.
+# Number of random splits into halves.
 _N_TRIALS = 10
-# Numbers of blocks of the jackknife; the largest standard deviation counts, because errors may
-# last longer than a block.
+# Numbers of blocks for the jackknife. The largest of the three standard deviations is used, because
+# errors may last longer than a block.
 _JACKKNIFE_BLOCKS = (8, 16, 32)
-# Factor of this standard deviation for the stated sizes, because the jackknife of another recording
-# of the same drive differs. Share of errors that fresh draws of 56 simulated drives found: 88 %
-# with a factor of 1 (clocks 84, lengths 80 %), 93 % with 1.25 (92, 91 %).
+# The stated sizes use this multiple of the standard deviation: on another recording of the same
+# drive, the jackknife has another value. Measured with fresh draws of 56 simulated drives: a
+# multiple of 1 finds 88 % of the errors (clocks 84 %, lengths 80 %), and 1.25 finds 93 % (92 %, 91
+# %).
 _SIGMA_MARGIN = 1.2
-# Number of blocks that are split into halves.
+# Number of blocks for the random splits.
 _SPLIT_BLOCKS = 32
-# Fewest seconds of a recording: two in each of the fewest blocks of the jackknife.
+# Fewest seconds of a recording: two in each block of the coarsest jackknife.
 _LEAST_SECONDS = 2 * _JACKKNIFE_BLOCKS[0]
 
-# A shift has less weight in the stream check than in the linear evidence: the check estimates its
-# noise anew, with the shift. In fresh draws of 30 simulated drives, the check needed factors of 1.3
-# (median) and 1.6 (90 % of shifts).
+# A shift needs this multiple of the size that the linear evidence predicts, because the stream
+# check estimates its noise together with the shift. Measured with fresh draws of 30 simulated
+# drives: 1.3 (median) and 1.6 (90 % of the shifts).
 _WEIGHT_FACTOR = 1.6
-# Smallest shift (m or rad) that is stated. The check does not report a shift below its limit, and
-# the estimate of the shift by the check has an error, too.
+# Smallest stated shift (m or rad). The stream check does not report a shift below its own limit,
+# and its estimate of the shift also has an error.
 _LEAST_SHIFT = _SIGMA_MARGIN * LIMITS["mount_moved"].note
-# Shifts that the stream check must report: time as a share of the recording, and sign.
+# Shifts that the stream check must report: time of the shift as a share of the recording, and sign.
 _INJECTED = ((0.42, 1.0), (0.58, -1.0))
-# Factor by which a shift grows that the stream check does not report, and largest number of sizes.
+# If the stream check does not report a shift, its size is multiplied by this factor.
 _GROWTH = 1.4
+# Largest number of sizes that are tried.
 _N_SIZES = 4
 
-# The velocity of a pose is the difference of the poses this time (s) before and after.
+# The velocity at a pose is computed from the poses this time (s) before and after.
 _VELOCITY_STEP_S = 0.1
 
-# Larger errors (m, rad) are not stated, because the residuals are not linear in them.
+# Larger errors (m, rad) are not stated: the residuals are not linear in them.
 _LARGEST = np.repeat([10.0, 0.5], 3)
 
 # Columns of the unknowns.
@@ -96,7 +98,7 @@ _SCALE = 7
 
 
 def examine(result: Calibration, snapshot: Snapshot) -> Calibration:
-    """Return a result with its :class:`Detectability`; without it if the recording is short.
+    """Return a result with its :class:`Detectability`, or without it for a short recording.
 
     Parameters
     ----------
@@ -135,7 +137,7 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
     """
     X = result.T_parent_child
     blocks = evidence_of(pose_pairs, X)
-    # The solve estimates X together with these unknowns.
+    # Besides X, the solve estimates these unknowns.
     estimated = []
     if result.time_offset_sigma_s:
         estimated.append(_TIME_OFFSET)
@@ -146,7 +148,7 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
     errors = _smallest_errors(
         blocks, [*_OF_X, *estimated], R, sigmas, allowance
     )
-    # Time offset and scale are stated even if the solve did not estimate them.
+    # Time offset and scale also get a size if the solve did not estimate them.
     of_streams = [*_OF_X, _TIME_OFFSET, _SCALE]
     errors_of_streams = _smallest_errors(
         blocks, of_streams, R, sigmas, allowance
@@ -154,7 +156,7 @@ def detectability(result: Calibration, pose_pairs: PosePairs) -> Detectability:
     is_known = [
         dof.verdict in _BY_MOTION for dof in result.observability_measured
     ]
-    # Sizes of shifts that are tried first. They grow until the stream check reports the shift.
+    # First sizes of the shifts. They are increased until the stream check reports the shift.
     first_shifts = _first_shifts(blocks, R)
     return Detectability(
         errors=_by_axis(errors[:6], is_known),
@@ -178,7 +180,7 @@ def evidence_of(pose_pairs: PosePairs, X: FloatArray) -> Blocks:
 
 def sigmas_of(result: Calibration) -> tuple[FloatArray, FloatArray]:
     """Return the measured standard deviations (8,) of all unknowns, and the allowance (8,)."""
-    # Unknown axes have no finite standard deviation, and no size is stated for them.
+    # Unknown axes have no finite standard deviation, and get no size.
     measured = np.nan_to_num(result.sigmas_measured, posinf=0.0)
     of_streams = np.zeros(2)
     return np.append(measured, of_streams), np.append(
@@ -233,8 +235,8 @@ def _smallest_errors(
 ) -> FloatArray:
     """Return the smallest errors (k,) of k unknowns that nine of ten trials find.
 
-    ``allowance`` (8,) has standard deviations of constant errors. The other parameters are those
-    of :func:`trials`.
+    ``allowance`` (8,) has standard deviations of constant errors. For the other parameters see
+    :func:`trials`.
     """
     sigmas, differences = trials(blocks, columns, R, sigmas)
     thresholds = thresholds_of(_SIGMA_MARGIN * sigmas, allowance[columns])
@@ -264,7 +266,7 @@ def trials(
     R : (3, 3) array
         Rotation from the child's axes to the parent's.
     sigmas : (8,) array
-        Standard deviations of the unknowns by the result; zero for those that it does not have.
+        Standard deviations of the unknowns in the result; zero for unknowns that it lacks.
     """
     turn = np.eye(len(columns))
     turn[:3, :3] = R
@@ -284,7 +286,7 @@ def _differences_of_halves(blocks: Blocks, columns: list[int]) -> FloatArray:
     """Return the differences (10, k) of estimates from random halves of a recording."""
     n_blocks = min(_SPLIT_BLOCKS, len(blocks.sums) // 2)
     sums = blocks.merged(n_blocks).sums
-    # The same recording always has the same splits.
+    # Equal recordings always get equal splits.
     rng = np.random.default_rng(0)
     differences = []
     for _ in range(_N_TRIALS):
@@ -296,7 +298,7 @@ def _differences_of_halves(blocks: Blocks, columns: list[int]) -> FloatArray:
 
 
 def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
-    """Return shifts (6,) of the mount half-way that the stream check should report.
+    """Return shifts (6,) in the middle of the recording that the stream check should report.
 
     Evidence ``[H S]`` without a shift has the score ``S + a H u`` after a shift of size a along the
     unit vector u. The log likelihood ratio is a quadratic function of a. Without noise, S is zero.
@@ -321,7 +323,7 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     squares = (
         scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)
     ).sum(axis=0)
-    # Without motion, no shift along an axis changes the score: its size is unlimited.
+    # Without motion, a shift along an axis does not change the score, so its size is unlimited.
     sizes = np.full(6, np.inf)
     np.divide(threshold, squares, out=sizes, where=squares > 0.0)
     return np.maximum(_WEIGHT_FACTOR * np.sqrt(sizes), _LEAST_SHIFT)
@@ -335,8 +337,8 @@ def _reported_shifts(
 ) -> dict[str, float]:
     """Return the smallest shifts that the stream check reports, by axis.
 
-    ``first`` (6,) are the first sizes that are tried; ``is_known`` marks the axes that the motion
-    determines. The other parameters are those of :func:`_smallest_reported`.
+    ``first`` (6,) are the first sizes, and ``is_known`` marks the axes that the motion determines.
+    For the other parameters see :func:`_smallest_reported`.
     """
     shifts = first.copy()
     for axis in range(6):
@@ -353,7 +355,7 @@ def _smallest_reported(
     Parameters
     ----------
     pose_pairs : PosePairs
-        Without a shift.
+        Poses without a shift.
     X : (4, 4) array
         Extrinsic.
     axis : int
@@ -377,7 +379,7 @@ def _smallest_reported(
 def _is_reported(
     pose_pairs: PosePairs, X: FloatArray, axis: int, share: float, size: float
 ) -> bool:
-    """Return whether the stream check reports a shift of a size after a share of the recording."""
+    """Return whether the stream check reports a shift after a share of the recording."""
     in_parent = np.zeros(6)
     in_parent[axis] = size
     xi = np.kron(np.eye(2), X[:3, :3].T) @ in_parent
@@ -391,7 +393,7 @@ def _is_reported(
     speed_m_s = usual_speed(
         pose_pairs.stamps_ns, se3.translation_of(pose_pairs.Ts_pw_p)
     )
-    # A fit to all motions lies between both mounts.
+    # A fit to all motions is between both mounts.
     between = X @ se3.exp(xi / 2.0)
     for suspect in slow_suspects(moved_pairs, motions, between, speed_m_s):
         if suspect.finding and suspect.finding.key == "mount_moved":

@@ -1,4 +1,4 @@
-"""Smallest errors that a recording contradicts, as a part of results and as a rule."""
+"""Smallest errors that a recording contradicts: a part of results, and a rule of the verdict."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -18,30 +18,31 @@ from hand_eye_calib.core.results.parts import Part
 from hand_eye_calib.core.results.reasons import Ground
 from hand_eye_calib.core.results.records import AXES, DofVerdict
 
-#: An injected error is contradicted above this many standard deviations: textbook, 1 of 370.
+#: An injected error is contradicted above this number of standard deviations (textbook: 1 of 370 by
+#: chance).
 SIGMAS = 3.0
 
-#: Share of the trials in which an error must be found.
+#: Share of the trials that must find an error.
 FOUND_SHARE = 0.9
-# Number of standard deviations that the size of a normal variable exceeds in 1 - FOUND_SHARE of all
+# A normal variable exceeds this number of standard deviations, in size, in 1 - FOUND_SHARE of all
 # cases.
 _SIGMAS_OF_SHARE = 1.645
 
-# Size of the control error, as a multiple of the error that the standard deviation makes
-# detectable. The largest ratio of 60 simulated recordings without faults is 2.4.
+# Size of the control error, as a multiple of the error that should be detectable by the standard
+# deviation. For 60 simulated recordings without faults, the largest ratio was 2.4.
 _CONTROL = 3.0
 
 
 class SizesAtFirstUse(Mapping[str, float]):
-    """Sizes by axis, which are computed when the first of them is read.
+    """Sizes by axis. They are computed when the first of them is read.
 
-    Most results are used without these sizes, and they take longer than a solve of DNLO. A copy
-    for another process is a plain dictionary.
+    Most callers do not use these sizes, and the computation takes longer than a solve of DNLO. A
+    copy for another process is a plain dictionary.
 
     Parameters
     ----------
     compute : callable
-        ``compute()`` returns the sizes by axis.
+        Function ``compute()`` that returns the sizes by axis.
     """
 
     def __init__(self, compute: Callable[[], Mapping[str, float]]) -> None:
@@ -50,7 +51,7 @@ class SizesAtFirstUse(Mapping[str, float]):
     @cached_property
     def _sizes(self) -> dict[str, float]:
         sizes = dict(self._compute())
-        # The poses in the function are not needed any more.
+        # The function holds the poses, which are no longer needed.
         del self._compute
         return sizes
 
@@ -72,13 +73,13 @@ class SizesAtFirstUse(Mapping[str, float]):
 
 @dataclass(frozen=True)
 class Detectability:
-    """Smallest errors that the recording of a result contradicts; infinite if there is none.
+    """Smallest errors that the recording of a result contradicts; infinite if there are none.
 
     Attributes
     ----------
     errors : mapping of str to float
-        Errors of the result along (m) and about (rad) the axes of the parent sensor. They are
-        larger than what an allowance for constant errors explains.
+        Errors of the result along (m) and about (rad) the axes of the parent sensor. The allowance
+        for constant errors does not explain them.
     shifts : mapping of str to float
         Shifts of the mount in the middle of the recording, along (m) and about (rad) these axes.
     time_offset_s : float
@@ -94,16 +95,16 @@ class Detectability:
 
 
 class DetectabilityPart(Part):
-    """The part of results with a :class:`Detectability`."""
+    """Part of results with a :class:`Detectability`."""
 
     def __init__(self) -> None:
         super().__init__("detectability", lambda: Detectability)
 
     def invert(self, value: Detectability) -> None:
-        """Return None, because the axes of the other sensor have other errors."""
+        """Return None: the axes of the other sensor have other errors."""
 
     def facts(self, value: Detectability | None, result: Any) -> list[str]:
-        """Return sentences about the errors that would have shown."""
+        """Return sentences about the errors that would have been noticed."""
         if value is None:
             return []
         facts = []
@@ -121,7 +122,7 @@ class DetectabilityPart(Part):
 
 
 def _of_streams(value: Detectability) -> str:
-    """Return the noticeable errors of clock and scale; an empty text if there are none."""
+    """Return the detectable errors of clock and scale; empty if there are none."""
     if not (math.isfinite(value.time_offset_s) and math.isfinite(value.scale)):
         return ""
     milliseconds = two_digits(1e3 * value.time_offset_s)
@@ -142,10 +143,10 @@ def _amounts(sizes: Mapping[str, float]) -> str:
 
 
 def promised_error(measured: float, allowance: float) -> float:
-    """Return the detectable error if the standard deviation of a result is right.
+    """Return the detectable error that follows from the standard deviation of a result.
 
-    The judge is one half of the recording, and the error is in the result of the other half. The
-    difference of both has twice the standard deviation of the whole.
+    One half of the recording judges an error in the result of the other half. The difference of
+    both halves has twice the standard deviation of the whole recording.
 
     Parameters
     ----------
@@ -164,7 +165,7 @@ def find_undetectable(result: Any) -> Iterator[Ground]:
     if any(
         dof.verdict is DofVerdict.PRIOR for dof in result.observability_measured
     ):
-        # A prior or the ground determines more than the motion can contradict.
+        # A prior or the ground may determine more than the motion can contradict.
         return
     sizes = {}
     promises = {}

@@ -50,15 +50,15 @@ from hand_eye_calib.offline.cli.reporting import REPORT
 # Largest number of results on the terminal. rows.csv contains all results.
 _MOST_LINES = 200
 
-# Verdicts of outcomes, the worst first.
+# Verdicts of outcomes, the gravest first.
 _GRAVITY = ("failed", *(verdict.value for verdict in reversed(Verdict)))
 
-# Beginnings of formulas in spreadsheets; some spreadsheets also accept full-width characters.
+# First characters of formulas in spreadsheets; some spreadsheets also accept full-width characters.
 _FORMULA = ("=", "+", "-", "@", *"＝＋－＠")
 
 
 def run_batch(arguments: argparse.Namespace) -> int:
-    """Calibrate from many recordings; return the exit code.
+    """Calibrate many recordings. Return the exit code.
 
     A recording that fails becomes a row with its error.
 
@@ -95,7 +95,7 @@ def run_batch(arguments: argparse.Namespace) -> int:
 def _note_recordings_without_vehicle(
     done: Sequence[Outcome], pattern: str | None
 ) -> None:
-    """Print that results without a vehicle are not compared, and how they get one."""
+    """Print that results without a vehicle are not compared, and how to name the vehicle."""
     n_alone = 0
     for outcome in done:
         if outcome.row["verdict"] and not outcome.row["vehicle"]:
@@ -122,7 +122,7 @@ def _code_of_vehicle(result: Calibration) -> int:
 def _print_json(
     title: str, done: Sequence[Outcome], vehicles: Mapping[str, Calibration]
 ) -> None:
-    """Print one JSON document with all outcomes. Each outcome is a JSON text already."""
+    """Print one JSON document with all outcomes. Each outcome already is a JSON text."""
     document = {
         "batch": title,
         "counts": dict(Counter(outcome.verdict for outcome in done)),
@@ -219,9 +219,9 @@ def _earlier_outcomes(
 
 
 def stored(task: Task, directory: Path) -> Outcome | None:
-    """Return the outcome of an earlier run; None if it is absent, failed or of other data.
+    """Return the outcome of an earlier run; None if it is missing, failed, or for other data.
 
-    A failed run has stored an empty key, see :func:`_store`. An empty key is never that of a task.
+    A failed run has an empty key, see :func:`_store`. No task has an empty key.
     """
     try:
         about, text = (
@@ -235,7 +235,7 @@ def stored(task: Task, directory: Path) -> Outcome | None:
             if state["key"] == task.key()
             else None
         )
-    # The task is repeated, whatever is wrong with the file.
+    # The task is repeated for any problem with the file.
     except Exception:
         return None
 
@@ -247,7 +247,7 @@ def _store(task: Task, outcome: Outcome, directory: Path) -> None:
         save_result(outcome.calibration, folder, outcome.inputs)
     if outcome.page:
         save_text(folder / REPORT, outcome.page)
-    # A failed task is always repeated. It has no key, because its bag may be unreadable.
+    # A failed task has no key, so that it is repeated. Its bag may be unreadable.
     key = "" if outcome.row["error"] else task.key()
     about = json.dumps({"key": key, "row": outcome.row, "code": outcome.code})
     save_text(folder / work.STATE, f"{about}\n{outcome.text}\n")
@@ -277,8 +277,8 @@ def _vehicles(
 ) -> dict[str, Calibration]:
     """Return the result of each vehicle by its name.
 
-    The result of a single recording is that of its vehicle. Several recordings have a common
-    result; that of an earlier run with the same recordings is reused.
+    A vehicle with a single recording has the result of this recording. Several recordings have a
+    common result. If an earlier run had the same recordings, its result is reused.
     """
     groups: dict[str, list[Outcome]] = {}
     for outcome in done:

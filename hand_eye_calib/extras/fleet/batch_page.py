@@ -100,7 +100,7 @@ def render_batch(
 
 
 def _gravity(verdict: str) -> int:
-    """Return the place of a verdict in the order of gravity; failures come first."""
+    """Return the place of a verdict in the order of gravity. Failures are first."""
     return _GRAVITY.index(TONES.get(verdict, "bad"))
 
 
@@ -133,7 +133,7 @@ def _draw_axis(
 ) -> None:
     """Draw the differences of recordings from the common value of an axis (m or rad).
 
-    ``sigma`` is the measured standard deviation of the common value. ``days`` are the places of the
+    ``sigma`` is the measured standard deviation of the common value. ``days`` has the places of the
     recordings on the x axis.
     """
     factor = 100.0

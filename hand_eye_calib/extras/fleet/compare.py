@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _repeated_recordings(paths: Sequence[str]) -> Iterator[str]:
-    """Yield a note for each two results of one recording."""
+    """Yield a note for each pair of results from one recording."""
     from hand_eye_calib.formats.results import recording_of
 
     recordings = {path: recording_of(path) for path in paths}
@@ -119,7 +119,7 @@ def _lines(
 ) -> Iterator[str]:
     """Yield the lines of a comparison for a terminal.
 
-    ``installed`` is the transform that the results are compared with, as the user typed it.
+    ``installed`` is the installed transform as typed by the user.
     """
     yield f"Mount of {result.child_frame} on {result.parent_frame}: {comparison.sentence}"
     for difference in comparison.differences:

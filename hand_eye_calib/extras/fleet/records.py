@@ -1,4 +1,4 @@
-"""The part of a common result that describes its recordings."""
+"""Part of a common result that describes its recordings."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,9 +15,9 @@ class Recorded:
     ----------
     name, headline : str
     left_out : str
-        Why the common result does not contain the recording; empty if it contains it.
+        Reason why the recording is not in the common result; empty if it is.
     deviations, sigmas : mapping of str to float
-        Deviations from the common result by axis (m or rad), and their standard deviations. These
+        Deviations from the common result by axis (m or rad), and their standard deviations, which
         contain the usual scatter between recordings. Axes that the recording does not determine are
         NaN (None in files).
     time_offset_s, scale, stamp_ns
@@ -47,7 +47,8 @@ class Together:
     sentence : str
         The agreement in words.
     scatter : mapping of str to float
-        Standard deviation between recordings by axis (m or rad), in addition to their own.
+        Standard deviation between recordings by axis (m or rad), in addition to those of the
+        recordings.
     recordings : tuple of Recorded
         In order of time.
     """
@@ -78,7 +79,7 @@ _ADVICE = {
 
 
 def find_kinds(rule: str, result: Any) -> Iterator[Ground]:
-    """Yield a ground if the agreement of the recordings is of a kind that the rule names."""
+    """Yield a ground if the agreement of the recordings has a kind for which the rule is."""
     together = result.parts.get("together")
     if together and together.kind in RULES[rule]:
         yield Ground(together.sentence, _ADVICE[together.kind])

@@ -88,10 +88,10 @@ def calibrate_together(
 ) -> Calibration:
     """Estimate one extrinsic from several recordings of one rig.
 
-    Each recording is calibrated separately, with its own clock offset and scale. The results are
-    averaged with weights from their covariances and from the scatter between recordings. An axis
-    that a recording does not determine is taken from the others. A recording that contradicts the
-    others is named and left out.
+    Each recording is calibrated separately, with its own clock offset and scale. The mean of the
+    results is weighted by their covariances and by the scatter between recordings. An axis that a
+    recording does not determine comes from the others. A recording that contradicts the others is
+    named and left out.
 
     Parameters
     ----------
@@ -111,9 +111,9 @@ def calibrate_together(
     Raises
     ------
     InputError
-        If no recording can be used, or the recordings have different frames.
+        If no recording is usable, or the recordings have different frames.
     HandEyeCalibError
-        The errors of ``calibrate``, with the name of the recording.
+        Errors of ``calibrate``, with the name of the recording.
 
     Examples
     --------
@@ -214,14 +214,14 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     Parameters
     ----------
     results : mapping of str to Calibration
-        Results by the names of the recordings. The common result has the most frequent method and
-        the frames and targets of the newest recording. It has a clock offset and a scale only if
-        all recordings have the same.
+        Results by recording. The common result has the most frequent method, and the frames and
+        targets of the newest recording. It has a clock offset and a scale only if all recordings
+        have equal values.
 
     Raises
     ------
     InputError
-        If no recording can be used, or the recordings have different frames.
+        If no recording is usable, or the recordings have different frames.
     """
     results = dict(sorted(results.items(), key=lambda item: item[1].stamp_ns))
     require_same_frames(results.values())
@@ -252,7 +252,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
 
 
 def _nothing_usable(left_out: Mapping[str, str]) -> InputError:
-    """Return the error that every recording was left out, with the reason of each recording."""
+    """Return the error that no recording is usable, with the reason for each recording."""
     reasons = "; ".join(
         f"{name}: {reason}" for name, reason in left_out.items()
     )
@@ -298,7 +298,7 @@ def _records_of(
 
 
 def _is_unusable(result: Calibration) -> bool:
-    """Return whether the verdict is DO NOT USE for another reason than unknown axes."""
+    """Return whether the verdict is DO NOT USE for a reason other than unknown axes."""
     rules = {
         reason.rule
         for reason in result.reasons
@@ -308,7 +308,7 @@ def _is_unusable(result: Calibration) -> bool:
 
 
 def _warnings_of(recordings: Mapping[str, Calibration]) -> tuple[str, ...]:
-    """Return each different warning, with the recordings that have it unless all have it."""
+    """Return the different warnings, with their recordings unless all recordings have them."""
     names: dict[str, list[str]] = {}
     for name, result in recordings.items():
         for warning in result.warnings:
@@ -362,8 +362,8 @@ def _joint(
 def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
     """Assess the common result of recordings.
 
-    If all recordings have an axis from a prior, they share one measurement by hand. Then the
-    standard deviation of the axis is at least the smallest one among the recordings.
+    If an axis is from a prior in all recordings, they share one measurement by hand. The standard
+    deviation of the axis is then at least the smallest among the recordings.
     """
     T = agreement.T_parent_child
     covariance = agreement.covariance.copy()
@@ -385,7 +385,7 @@ def _assessed(used: Sequence[Calibration], agreement: Agreement) -> Assessment:
 
 
 def _gravest_of_each(used: Sequence[Calibration]) -> tuple[Finding, ...]:
-    """Return the gravest finding of each code and stream."""
+    """Return the gravest finding for each code and stream."""
     all_findings: list[Finding] = []
     for result in used:
         all_findings += result.findings

@@ -1,4 +1,4 @@
-"""Tasks of a batch, and their distribution to processes or a Dask cluster."""
+"""Tasks of a batch, and their distribution over processes or a Dask cluster."""
 
 import hashlib
 import json
@@ -77,9 +77,9 @@ class Task:
     with_report: bool = False
 
     def key(self) -> str:
-        """Return a digest of the task, its options, and names, sizes and times of its files.
+        """Return a digest of the task: its options, and names, sizes and times of its files.
 
-        A stored result with another key belongs to other data or options.
+        A stored result with another key is for other data or options.
         """
         states = list(map(_state, self.bags))
         text = json.dumps([asdict(self), states], sort_keys=True)
@@ -149,7 +149,7 @@ def _vehicle_of(bag: str, vehicle: str) -> str:
 def _full_path(bag: str) -> Path:
     """Return the path of a bag, or a URL without its query.
 
-    The path is resolved, because a path such as "." has no name.
+    Resolve the path, because a path such as "." has no name.
     """
     if remote.is_url(bag):
         return Path(bag.partition("?")[0])
@@ -272,7 +272,7 @@ def work(task: Task) -> Outcome:
     """Perform a task. Errors become part of the outcome, so that other tasks continue."""
     from hand_eye_calib.offline.report.report import render
 
-    # Limit this worker process.
+    # Limit the memory of this worker process.
     limit_memory()
     try:
         with remote.local_copies(task.bags) as (paths, restore_urls):
@@ -302,10 +302,10 @@ def work(task: Task) -> Outcome:
 def outcomes(
     tasks: Sequence[Task], jobs: int, dask: str | None = None, do: Work = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Perform tasks in worker processes; yield each task with its outcome when it is done.
+    """Perform tasks in worker processes. Yield each finished task with its outcome.
 
-    If a worker dies, the tasks that may have killed it are repeated separately. Then the other
-    unfinished tasks are repeated together.
+    If a worker dies, the tasks that may have killed it are repeated separately. Other unfinished
+    tasks are then repeated together.
 
     Parameters
     ----------
@@ -360,7 +360,7 @@ def _groups_to_repeat(
     """Return groups of tasks to repeat after a worker died.
 
     Workers begin tasks in order, so one of the first ``jobs`` tasks has killed the worker. Each of
-    these tasks is a group of its own; the others are one group.
+    these tasks gets its own group; the other tasks form one group.
     """
     groups = [[task] for task in unfinished[:jobs]]
     others = [*unfinished[jobs:]]
@@ -371,7 +371,7 @@ def _groups_to_repeat(
 def _processes(jobs: int) -> Iterator[Executor]:
     """Start worker processes by spawning: forking a program with threads is not safe."""
     spawning = multiprocessing.get_context("spawn")
-    # A worker is started as `python -c`, which would import modules from the current folder.
+    # A worker starts as `python -c`, which would import modules from the current folder.
     with starting_trusted():
         executor = ProcessPoolExecutor(jobs, spawning, initializer=_begin)
         try:
@@ -392,7 +392,7 @@ def _begin() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait for the end of the parent process, even a killed one, and end this process."""
+    """Wait for the end of the parent process, even if it is killed, and end this process."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker is started by another process"
     parent.join()

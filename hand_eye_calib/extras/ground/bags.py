@@ -38,7 +38,7 @@ def verticals_of_bag(
 ) -> tuple[tuple[VerticalPair, ...], list[str]]:
     """Return the verticals of both sensors of a bag, and notes for the user.
 
-    There are no verticals if a sensor has neither clouds nor IMU data.
+    The result is empty if a sensor has neither clouds nor IMU data.
 
     A topic belongs to a sensor if its ``frame_id`` is the frame of the poses of this sensor. Clouds
     are preferred to IMU data, because the ground also determines the height.
@@ -61,7 +61,7 @@ def verticals_of_bag(
             return (), []
         topics = (parent, child)
         has_imu = any(bag.topics[topic].type == _IMU for topic in topics)
-        # A lidar needs a wider lane if the other sensor is an IMU.
+        # If the other sensor is an IMU, a lidar needs a wider lane.
         other_source: Source = "gravity" if has_imu else "ground"
     tracks = []
     for topic, stream in zip(topics, snapshot.streams, strict=True):
@@ -81,7 +81,7 @@ def verticals_of_bag(
 
 
 def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
-    """Return one topic for each frame: clouds if there are any, otherwise IMU data.
+    """Return one topic per frame: clouds if there are any, otherwise IMU data.
 
     If a frame has several topics of a type, the topic with most messages is returned.
     """
@@ -94,7 +94,7 @@ def _topics_by_frame(bag: PoseBag) -> Mapping[str, str]:
 def vertical_topics(bag: PoseBag) -> dict[str, tuple[str, str]]:
     """Return the quantity ("ground" or "gravity") and the frame of clouds and IMU data, by topic.
 
-    Topics with clouds are first; of each type, the topic with most messages is first.
+    Topics with clouds are first. Topics of a type are sorted by their numbers of messages.
     """
     found: dict[str, tuple[str, str]] = {}
     for message_type, quantity in _QUANTITIES.items():
@@ -117,9 +117,9 @@ def _track_of_bag(
 ) -> VerticalTrack:
     """Return the vertical from a topic of a bag.
 
-    The result is cached, because all pairs of a rig need the vertical of the first sensor.
+    The result is cached: all pairs of a rig need the vertical of the first sensor.
 
-    The parameters are those of :func:`vertical_track`.
+    For the parameters see :func:`vertical_track`.
     """
     with PoseBag(*paths) as bag:
         return vertical_track(bag, topic, stream, other_source)

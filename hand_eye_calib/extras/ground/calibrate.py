@@ -19,7 +19,7 @@ def calibrate_on_ground(
     child_ground: VerticalTrack,
     **options: Any,
 ) -> Calibration:
-    """Estimate the pose of the child sensor from the motion, and from the ground or gravity.
+    """Estimate the pose of the child sensor from the motion and from the ground or gravity.
 
     On a flat floor, motion alone does not determine z, roll and pitch. Two lidars that measure the
     ground determine them. Gravity determines roll and pitch.
@@ -28,7 +28,7 @@ def calibrate_on_ground(
     ----------
     parent, child : Trajectory
     parent_ground, child_ground : VerticalTrack
-        From :func:`hand_eye_calib.ground_from_clouds`,
+        Results of :func:`hand_eye_calib.ground_from_clouds`,
         :func:`hand_eye_calib.gravity_from_accelerations` or
         :func:`hand_eye_calib.gravity_from_attitude`.
     **options
@@ -37,8 +37,8 @@ def calibrate_on_ground(
     Returns
     -------
     Calibration
-        ``result.ground`` has the measurements by the ground or gravity. If they disagree with the
-        motion, the result is that of the motion alone.
+        ``result.ground`` has the measurements from the ground or gravity. If they disagree with the
+        motion, the result is from the motion alone.
 
     Raises
     ------

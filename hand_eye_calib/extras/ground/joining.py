@@ -1,15 +1,15 @@
-"""Update a result of the motion with the vertical that both sensors measure.
+"""Update a result of the motion with the vertical that both sensors have measured.
 
 The extrinsic X has the rotation R and the translation t, from the child to the parent. Both sensors
 measure the vertical (unit vectors n_p, n_c) and their height over the ground (h_p, h_c):
 
     n_p = R n_c,    n_p . t = h_c - h_p.
 
-If one sensor measures the ground and the other gravity, n_p and R n_c differ by the slope s of the
-road. The slope turns with the heading, and an error of R does not. So s and the error of R are
-estimated together. One update of a Kalman filter joins this measurement with X. Reference:
-Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with applications to tracking and navigation*,
-2001, section 5.2.
+If one sensor measures the ground and the other sensor gravity, n_p and R n_c differ by the slope s
+of the road. The slope changes with the heading, but an error of R does not. So s and the error of R
+are estimated together. An update of a Kalman filter then combines this measurement with X.
+Reference: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, *Estimation with applications to tracking and
+navigation*, 2001, section 5.2.
 """
 
 from dataclasses import dataclass, replace
@@ -35,22 +35,22 @@ from hand_eye_calib.core.results.rules import CONTRADICTED_SIGMAS
 from hand_eye_calib.extras.ground.part import GroundAxis, GroundResult
 from hand_eye_calib.extras.ground.tracks import VerticalTrack
 
-# Number of sections of the drive, equally long on the road. A third of them must have data.
+# Number of equally long sections of the drive. A third of them must have data.
 _N_SECTIONS = 24
 
 # Prior standard deviation of the slope of a road (rad): half the slope of steep roads (10 %).
 _SLOPE_SIGMA_RAD = 0.05
 
-# The following standard deviations are of constant errors of one sensor, which no drive reveals.
-# Error of the height (m): root mean square on 80 simulated drives in five places, with the errors
-# that data sheets of rotating lidars state: 1 cm for ranges, 0.05 deg for elevations of beams.
+# Standard deviation of a constant error of the height (m) of one sensor, which no drive reveals. It
+# is the root mean square on 80 simulated drives in five places, with the errors in data sheets of
+# rotating lidars: 1 cm for ranges, 0.05 deg for elevations of beams.
 _HEIGHT_SIGMA_M = 0.007
-# Error of the vertical (rad), by what the sensor measures. Ground: 0.02 deg, root mean square on 26
-# simulated drives with errors of their own.
-# Gravity: data sheets of industrial accelerometers state a bias of 2 mg.
+# Standard deviation of a constant error of the vertical (rad), by measured quantity. Ground: 0.02
+# deg, root mean square on 26 further simulated drives. Gravity: the bias of 2 mg in data sheets of
+# industrial accelerometers.
 _TILT_SIGMAS_RAD = {"ground": float(np.radians(0.02)), "gravity": 0.002}
-# Share of the bend of a road that remains in the vertical of the lane: 0.3 to 0.5 on simulated
-# streets with a crown of 2 %, for the whole road.
+# Share of the bend of a road that remains in the vertical of the lane. Measured for the whole road:
+# 0.3 to 0.5 on simulated streets with a crown of 2 %.
 _BEND_SHARE = 0.5
 
 
@@ -62,10 +62,10 @@ class Measurement(NamedTuple):
     Attributes
     ----------
     axes : tuple of str
-        Axis of the parent that is nearest to each row: two rotations, and one translation if both
-        sensors measure heights.
+        Axis of the parent nearest to each row: two rotations, and one translation if both sensors
+        measure heights.
     values : (M,) array
-        Measured minus predicted values (rad, m), at the extrinsic of the linearisation.
+        Measured minus predicted values (rad, m) at the linearisation point.
     jacobian : (M, 6) array
     covariance : (M, M) array
     """
@@ -78,7 +78,7 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True)
 class VerticalPair:
-    """Verticals that both sensors measured, from which the extrinsic is measured."""
+    """Verticals of both sensors at the same time, as a measurement of the extrinsic."""
 
     parent: VerticalTrack
     child: VerticalTrack
@@ -91,12 +91,12 @@ class VerticalPair:
         calibration : Calibration
             Result of the motion alone.
         snapshot : Snapshot
-            The streams of the result.
+            Streams of the result.
 
         Returns
         -------
         Calibration
-            With a :class:`GroundResult`, or unchanged if there are too few data.
+            Result with a :class:`GroundResult`. It is unchanged if there are too few data.
         """
         measurement = self.measurement(calibration, snapshot)
         if measurement is None:
@@ -123,7 +123,8 @@ class VerticalPair:
     ) -> Measurement | None:
         """Return the measurement, linearised at a result.
 
-        Return None if no instants are common, or if too few sections of the drive have data.
+        The result is None if there are no common instants, or if too few sections of the drive have
+        data.
         """
         T = calibration.T_parent_child
         R = se3.rotation_of(T)
@@ -149,7 +150,7 @@ class VerticalPair:
             values, covariance = _fit(means)
         for track in (parent, child):
             tilt_variance += _TILT_SIGMAS_RAD[track.source] ** 2
-            # The bend turns with the vehicle, and so looks like the mount.
+            # The bend moves with the vehicle, so it looks like a tilt of the mount.
             tilt_variance += (_BEND_SHARE * track.bend_rad) ** 2
         variances = [tilt_variance, tilt_variance, 2 * _HEIGHT_SIGMA_M**2]
         # Rows: rotation about two horizontal axes, translation along the vertical.
@@ -166,8 +167,8 @@ def _at_same_times(
 ) -> tuple[VerticalTrack, VerticalTrack]:
     """Return the rows of parent and child at common instants, as two tracks of K rows.
 
-    The instants of a row differ by less than the usual interval of the child. ``offset_s`` is added
-    to the stamps of the child.
+    The instants in a row differ by less than the usual interval of the child. ``offset_s`` is added
+    to the child's stamps.
     """
     order = np.argsort(child.stamps_ns, kind="stable")
     child = child[order]
@@ -191,8 +192,8 @@ def _measured_axes(ups: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
     Returns
     -------
     basis : (3, 3) array
-        Right-handed unit vectors as columns: two horizontal directions, then the vertical. Each is
-        near to an axis of the parent.
+        Right-handed unit vectors as columns: two horizontal directions, then the vertical. Each
+        vector is near to an axis of the parent.
     axes : tuple of str
         Names of these axes of the parent: two rotations and one translation.
     """
@@ -220,12 +221,12 @@ def _differences(
     """Return differences (K, 2 or 3) between the parent and the child at each instant.
 
     The first two columns are tilts (rad) about the horizontal axes of the basis: the rotation from
-    the vertical of the child, in the frame of the parent, to the vertical of the parent. The third
-    column is the error (m) of the translation along the vertical, if both sensors measure heights.
+    the vertical of the child (in the parent's frame) to the vertical of the parent. If both sensors
+    measure heights, the third column is the error (m) of the translation along the vertical.
     """
     child_ups = child.ups @ se3.rotation_of(T).T
-    # The cross product of unit vectors has the direction of the rotation axis, and the length of
-    # the sine of the angle. A rotation vector has the length of the angle.
+    # The cross product of unit vectors is along the rotation axis, and its length is the sine of
+    # the angle. A rotation vector has the length of the angle.
     crosses = np.cross(child_ups, parent.ups)
     sines = np.linalg.norm(crosses, axis=1)
     cosines = np.einsum("ki,ki->k", child_ups, parent.ups)
@@ -240,7 +241,7 @@ def _differences(
         return tilts
     predicted_m = parent.ups @ se3.translation_of(T)
     errors_m = child.heights_m - parent.heights_m - predicted_m
-    # The vertical of the basis points down if the nearest axis of the parent does.
+    # If the nearest axis of the parent points down, the vertical of the basis points down.
     vertical = basis[:, 2]
     sign = np.sign(vertical @ parent.ups[0])
     return np.column_stack([tilts, sign * errors_m])
@@ -265,7 +266,7 @@ def _slope_derivatives(
     else:
         track = child
         stream = streams[1]
-        # Tilts are parent minus child, so the normal of the child has a negative sign.
+        # Tilts are parent minus child, so the child's normal has a negative sign.
         to_parent = -R
     poses = stream.at(track.stamps_ns, extrapolate=True)
     rotations = se3.rotation_of(poses)
@@ -281,8 +282,8 @@ def _slope_derivatives(
 def _are_inliers(differences: FloatArray) -> BoolArray:
     """Return a mask (K,) of the instants whose differences (K, M) are no outliers.
 
-    The gate about the median is ``CONTRADICTED_SIGMAS`` standard deviations, estimated from the
-    median deviation.
+    The gate about the median is ``CONTRADICTED_SIGMAS`` standard deviations, which are estimated
+    from the median deviation.
     """
     deviations = np.abs(differences - medians(differences.T))
     sigmas = medians(deviations.T) / MEDIAN_NORMAL
@@ -314,7 +315,7 @@ def _means(values: FloatArray, sections: IntArray) -> FloatArray:
 def _fit(means: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the mean (M,) over sections (B, M), and the covariance (M, M) of this mean.
 
-    The covariance follows from the scatter of the sections.
+    The covariance is computed from the scatter of the sections.
     """
     center = means.mean(axis=0)
     residuals = means - center
@@ -330,8 +331,8 @@ def _fit_with_slope(
 ) -> tuple[FloatArray, FloatArray]:
     """Estimate the tilt of the mount together with the slope of the road.
 
-    If the heading is constant, the slope cannot be distinguished from the mount. A prior limits the
-    slope then.
+    At constant heading, the slope cannot be distinguished from a tilt of the mount. A prior then
+    limits the slope.
 
     Parameters
     ----------
@@ -345,14 +346,15 @@ def _fit_with_slope(
     covariance : (2, 2) array
     """
     count = len(means)
-    # Unknowns: two tilts of the mount, which are the same in all sections, then two slopes.
+    # The unknowns are two tilts of the mount, equal in all sections, and two slopes.
     of_mount = np.tile(np.eye(2), (count, 1, 1))
     derivatives = np.concatenate([of_mount, slope_derivatives], axis=2)
     rows = derivatives.reshape(-1, 4)
     products = rows.T @ rows
     slope_information = _SLOPE_SIGMA_RAD**-2
     prior = np.diag([0.0, 0.0, slope_information, slope_information])
-    # The first solve has no prior. Its residuals determine the variance, which weights the prior.
+    # The first solve is without the prior. Its residuals determine the variance, with which the
+    # prior is weighted.
     variance = 0.0
     for _ in range(2):
         information = products + variance * prior
@@ -383,7 +385,7 @@ def _updated(
 ) -> Calibration:
     """Update a result by a Kalman gain (6, M).
 
-    Its covariance is the Joseph form ``(I - K H) C (I - K H)' + K V K'``.
+    The new covariance is the Joseph form ``(I - K H) C (I - K H)' + K V K'``.
     """
     correction = gain @ measurement.values
     T = se3.retracted(calibration.T_parent_child, correction)
@@ -406,7 +408,7 @@ def _updated(
         dof = judged(of_motion.name, sigma)
         is_unobservable = dof.verdict is DofVerdict.UNOBSERVABLE
         if is_unobservable and np.isfinite(of_motion.sigma):
-            # The rotation of the child has turned an unobservable direction slightly.
+            # The rotation of the child has slightly changed an unobservable direction.
             dof = of_motion
         is_by_ground = has_prior and dof.verdict is not DofVerdict.UNOBSERVABLE
         if is_by_ground or of_motion.verdict is DofVerdict.PRIOR:

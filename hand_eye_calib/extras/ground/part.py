@@ -1,7 +1,7 @@
-"""Part of a result about the axes that the ground and gravity measure.
+"""Part of a result about the axes that the ground and gravity determine.
 
-The part compares these axes with the same axes from the motion. It also has the reasons for the
-verdict if both disagree.
+The part compares these axes with the same axes from the motion. If both disagree, it also has the
+reasons for the verdict.
 """
 
 from collections.abc import Iterator
@@ -26,14 +26,14 @@ class GroundAxis:
     name : str
         Axis of the parent.
     motion, motion_sigma : float
-        Value and standard deviation by the motion alone. The standard deviation is infinite if the
-        motion does not determine the axis.
+        Value and standard deviation from the motion alone. The standard deviation is infinite if
+        the motion does not determine the axis.
     ground, ground_sigma : float
-        Value and standard deviation by the ground or gravity alone.
+        Value and standard deviation from the ground or gravity alone.
     distance : float
         Difference of both values in joint standard deviations.
     is_from_ground : bool
-        Whether the ground or gravity at least halves the variance that the motion alone has.
+        Whether the ground or gravity at least halves the variance from the motion alone.
     """
 
     name: str
@@ -76,7 +76,7 @@ class GroundPart(Part):
         return [_line(value, axis) for axis in value.axes]
 
     def headline(self, value: GroundResult) -> str:
-        """Return which axes are mostly from the ground or gravity; an empty text if none is."""
+        """Return the axes that are mostly from the ground or gravity; empty if there are none."""
         names = [axis.name for axis in value.axes if axis.is_from_ground]
         if not names:
             return ""
@@ -123,8 +123,8 @@ def disagreements(result: Any) -> Iterator[Ground]:
     if value is None or value.is_joined:
         return
     farthest = max(axis.distance for axis in value.axes)
-    # All axes together may contradict the motion (chi-square) although no single axis does. The
-    # axis with the largest distance is named then.
+    # All axes together may contradict the motion (chi-square), although no single axis does. The
+    # axis with the largest distance is then named.
     limit = min(CONTRADICTED_SIGMAS, farthest)
     source = _source(value)
     names = []

@@ -13,22 +13,23 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.blocks import Blocks
 
-# Smallest horizontal distance (m) of a point that is used: nearer points may be on the machine.
+# Smallest horizontal distance (m) of a used point. Nearer points may be on the machine.
 _MIN_RANGE_M = 1.5
-# Largest horizontal distance (m) of a point that is used: farther away, the road may bend.
+# Largest horizontal distance (m) of a used point. Farther away, the road may bend.
 _MAX_RANGE_M = 12.0
-# Smallest horizontal distance (m) that the ground must reach: a deck of the machine is shorter.
+# The ground must reach at least this horizontal distance (m). A deck of the machine is shorter.
 _MIN_REACH_M = 5.0
-# Side of a cell (m). Near rings of a lidar are dense; cells weight them as far rings.
+# Side of a cell (m). Near rings of a lidar are denser; in cells, they have the weight of far rings.
 _CELL_M = 0.5
 # Number of random planes of RANSAC.
 _N_TRIALS = 200
-# Largest slope of the ground against the expected vertical: the tangent of 15 deg.
+# Largest slope of the ground relative to the expected vertical: the tangent of 15 deg.
 _MAX_SLOPE = 0.27
-# Largest vertical distance (m) of an inlier from the plane, for grass and the noise of ranges.
+# Largest vertical distance (m) of an inlier from the plane. It allows for grass and the noise of
+# ranges.
 _MAX_INLIER_HEIGHT_M = 0.08
-# Largest share of the cells that may be clearly lower than the ground, by three times the height of
-# an inlier. A loading edge, for example, has more cells below it.
+# Largest share of the cells below the ground, by more than three times the height of an inlier. A
+# loading edge, for example, has more cells below it.
 _MAX_SHARE_BELOW = 0.08
 
 
@@ -50,10 +51,10 @@ def ground_of(
     Parameters
     ----------
     points : (N, 3) array
-        In the frame of the sensor, m.
+        Points in the frame of the sensor, m.
     up : (3,) array
-        Expected vertical in the frame of the sensor, a unit vector. The normal of the ground
-        differs from this vector by 15 deg at most.
+        Expected vertical in the frame of the sensor (unit vector). It differs from the normal of
+        the ground by at most 15 deg.
     ahead : (3,) array
         Direction of the drive in the frame of the sensor.
     width_m : float
@@ -66,7 +67,7 @@ def ground_of(
     plane = _plane_by_ransac(cells)
     if plane is None:
         return None
-    # The first fit uses the inliers of RANSAC, the second fit those of the first fit.
+    # The first fit uses the inliers of RANSAC, and the second fit the inliers of the first fit.
     for _ in range(2):
         distances_m = np.abs(cells[:, 2] - _heights(cells, plane))
         is_inlier = distances_m < _MAX_INLIER_HEIGHT_M
@@ -99,7 +100,7 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
     Parameters
     ----------
     points : (N, 3) array
-        Levelled points. Those above the sensor, too near or too far are skipped.
+        Levelled points. Points above the sensor, too near or too far are skipped.
     width_m : float
         Width of the lane.
     """
@@ -110,7 +111,7 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
     in_lane = np.abs(y) < width_m / 2
     is_below_sensor = z < 0.0
     used = points[is_beyond_machine & is_near & in_lane & is_below_sensor]
-    # Cells are cubes: a wall fills cubes of its own, and does not raise the ground at its foot.
+    # Cells are cubes. A wall fills its own cubes, and does not raise the ground at its foot.
     cubes = np.floor(used / _CELL_M).astype(int)
     _, cell_of_point, counts = np.unique(
         cubes, axis=0, return_inverse=True, return_counts=True
@@ -120,7 +121,7 @@ def _cell_means(points: FloatArray, width_m: float) -> FloatArray:
 
 
 def _rows(cells: FloatArray) -> FloatArray:
-    """Return rows (C, 3) of (x, y, 1); multiplied by a plane (a, b, c), they are its heights."""
+    """Return rows (C, 3) of (x, y, 1). Their product with a plane (a, b, c) has its heights."""
     return np.column_stack([cells[:, :2], np.ones(len(cells))])
 
 
@@ -130,16 +131,16 @@ def _heights(cells: FloatArray, planes: FloatArray) -> FloatArray:
 
 
 def _plane_by_ransac(cells: FloatArray) -> FloatArray | None:
-    """Return the plane (3,) with most inliers, of random planes through three cells.
+    """Return the plane (a, b, c) with most inliers, among random planes through three cells.
 
-    Return None if all random planes are too steep, or their cells nearly on a line.
+    None if all random planes are too steep, or if their cells are nearly on a line.
     """
     rng = np.random.default_rng(0)
     corners = rng.integers(len(cells), size=(_N_TRIALS, 3))
     triangles = cells[corners]
     ones = np.ones((_N_TRIALS, 3))
     rows = np.dstack([triangles[..., :2], ones])
-    # The determinant is twice the area of the triangle (m^2). A thin one determines no plane.
+    # The determinant is twice the area of the triangle (m^2). A thin triangle determines no plane.
     double_areas_m2 = np.abs(np.linalg.det(rows))
     is_regular = double_areas_m2 > 1.0
     regular_rows = rows[is_regular]
@@ -175,7 +176,7 @@ def _is_ground(
     places = inliers[:, :2]
     deviations = places - places.mean(axis=0)
     covariance = deviations.T @ deviations / len(inliers)
-    # A single ring of a lidar is nearly a line, which determines no plane.
+    # A single ring of a lidar is nearly a line, so it determines no plane.
     smallest_variance = np.linalg.eigvalsh(covariance)[0]
     is_wide = smallest_variance > _CELL_M**2
     lowest_m = _heights(cells, plane) - 3 * _MAX_INLIER_HEIGHT_M

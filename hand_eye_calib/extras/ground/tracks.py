@@ -23,20 +23,20 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns, Trajectory
 from hand_eye_calib.extras.ground.planes import Plane, ground_of
 
-#: Quantity that a vertical was measured by.
+#: Quantity from which a vertical was measured.
 Source: TypeAlias = Literal["ground", "gravity"]
 
-# Largest rotation about any other axis, as a share of the rotation about the main axis. A machine
-# that turns in curves only stays below; then its main axis is the vertical.
+# Largest rotation about another axis, as a share of the rotation about the main axis. A machine
+# that only drives curves is below this limit, and its main axis is the vertical.
 _MAX_OTHER_SHARE = 0.3
 
-# Width of the lane (m) in which points are used, by what the other sensor measures.
+# Width of the lane (m) whose points are used, by the quantity that the other sensor measures.
 _LANE_WIDTHS_M = {"ground": 4.0, "gravity": 24.0}
-# Width of the narrower lane (m) that reveals a bend: a crown, or tall grass on one side.
+# Width of a narrower lane (m) that reveals a bend, such as a crown, or tall grass on one side.
 _NARROW_WIDTHS_M = {"ground": 2.0, "gravity": 4.0}
 
-# Window (s) over which accelerations are averaged. In a longer window, errors of the velocities
-# matter less, and drift of the attitude matters more.
+# Time (s) over which accelerations are averaged. If it is longer, errors of the velocities matter
+# less, and drift of the attitude matters more.
 _WINDOW_S = 5.0
 
 
@@ -47,15 +47,15 @@ class VerticalTrack(Columns):
     Attributes
     ----------
     stamps_ns : (N,) int64 array
-        On the clock of the sensor.
+        Stamps on the clock of the sensor.
     ups : (N, 3) array
         Unit vectors that point up, in the frame of the sensor: normals of the ground, or the
         opposite of gravity.
     heights_m : (N,) array or None
         Heights of the sensor over the ground; None for gravity.
     bend_rad : float
-        Angle between the ground of the lane and that of a narrower lane, as on a crowned road, or
-        beside tall grass. Zero for gravity.
+        Angle between the ground of the lane and of a narrower lane, for example on a crowned road
+        or beside tall grass. Zero for gravity.
     """
 
     stamps_ns: IntArray
@@ -79,15 +79,15 @@ def ground_from_clouds(
     Parameters
     ----------
     clouds : iterable of (int, (N, 3) array)
-        Stamp (ns) and points (m, in the frame of the lidar) of each scan. One or two scans a second
-        suffice.
+        Stamp (ns) and points (m, in the frame of the lidar) of each scan. One or two scans per
+        second are sufficient.
     trajectory : Trajectory
         Poses of the lidar. The ground is perpendicular to the axis about which the lidar turns in
         curves.
     beside : {"ground", "gravity"}
-        Quantity that the other sensor measures. "ground": only points in the lane of the machine
-        are used, because a crown bends the road beside the lane. "gravity": points of the whole
-        road are used, because both sides of a crown together are level.
+        Quantity that the other sensor measures. With "ground", only points in the lane of the
+        machine are used, because a crown bends the road beside the lane. With "gravity", points of
+        the whole road are used, because both sides of a crown together are level.
 
     Returns
     -------
@@ -107,8 +107,8 @@ def ground_from_clouds(
         clouds, turning_axis(trajectory), driving_direction(trajectory), beside
     )
     n_planes = len(scans.planes)
-    # On a ramp or beside walls, a third of the scans may have no ground. If fewer than half of the
-    # scans have a plane, the machine does not drive on this plane.
+    # On a ramp or beside walls, a third of the scans may have no ground. If less than half of them
+    # have a plane, the machine does not drive on this plane.
     if 2 * n_planes <= scans.n_scans:
         raise NotEnoughDataError(
             f"{n_planes} of {scans.n_scans} scans contain the ground: it must be visible between 5 "
@@ -118,7 +118,7 @@ def ground_from_clouds(
     stamps_ns = np.array(scans.stamps_ns, dtype=np.int64)
     bend_rad = 0.0
     if scans.bends:
-        # The median vector is that of the road; single scans differ by noise and by walls.
+        # The median vector belongs to the road. Single scans differ by noise and by walls.
         bend = medians(np.array(scans.bends).T)
         bend_rad = float(np.linalg.norm(bend))
     return VerticalTrack(
@@ -193,8 +193,8 @@ def gravity_from_accelerations(
     Raises
     ------
     NotEnoughDataError
-        If both streams overlap for less than three windows of 5 s, or if the mean force is not that
-        of gravity.
+        If both streams overlap for less than three windows of 5 s, or if the mean force is not
+        about gravity.
 
     Examples
     --------
@@ -225,7 +225,7 @@ def gravity_from_accelerations(
             f"the mean acceleration is {length:.2f} m/s^2, not that of gravity: the driver of the "
             "IMU must not subtract gravity"
         )
-    # The world of the poses tilts slowly, so its vertical is interpolated between the windows.
+    # The world of the poses tilts slowly. Interpolate its vertical between the windows.
     stamps = trajectory.stamps_ns
     stamps = stamps[(stamps >= middles_ns[0]) & (stamps <= middles_ns[-1])]
     since_s = (stamps - middles_ns[0]) * 1e-9
@@ -313,14 +313,14 @@ def _velocities(trajectory: Trajectory, stamps_ns: IntArray) -> FloatArray:
 def turning_axis(trajectory: Trajectory) -> FloatArray:
     """Estimate the vertical (3,) in the frame of the sensor: the main axis of its rotation.
 
-    The sign assumes that the z axis of the sensor points up and not down.
+    The sign is chosen so that the z axis of the sensor points up.
 
     Raises
     ------
     NotEnoughDataError
         If the sensor turns about several axes, or not at all.
     """
-    # Rotations over a second are larger than the noise of single poses.
+    # Rotations over a second exceed the noise of single poses.
     step = max(1, round(1.0 / trajectory.interval_s))
     poses = trajectory.poses[::step]
     rotations = se3.rotation_of(poses)

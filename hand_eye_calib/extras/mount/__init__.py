@@ -12,7 +12,7 @@ def register() -> None:
 
 
 def _compare(arguments: Any) -> int | None:
-    """Compare digests, and return the exit code; None if the arguments are no digests."""
+    """Compare digests and return the exit code, or None if the arguments are not digests."""
     from hand_eye_calib.extras.mount.compare import compare_digests
 
     return compare_digests(arguments)

@@ -1,4 +1,4 @@
-"""Digests: what a monitored session contains about the mount, in a file below 10 kB.
+"""Digests: the information on the mount from a monitored session, in a file below 10 kB.
 
 A digest contains the information matrix H and the score S of the whole session on a shift of the
 child sensor from the installed extrinsic (:mod:`hand_eye_calib.core.assessment.moved`). Both are
@@ -38,7 +38,7 @@ _LARGEST = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Digest:
-    """What one monitored session contains about the mount.
+    """Information on the mount from one monitored session.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Digest:
     installed : (4, 4) array
         Installed pose of the child sensor in the parent sensor's frame.
     covariance : (6, 6) array
-        Covariance of the offset from the installed extrinsic that exists without any shift, in the
+        Covariance of the offset from the installed extrinsic that exists without a shift, in the
         child's frame.
     wander : (6, 6) array
         Covariance of the part of this offset that differs from session to session, in the child's
@@ -84,7 +84,8 @@ class Digest:
     def parts(self) -> "list[Digest]":
         """Return the session, divided at the shift that raised its alarm.
 
-        The part since the shift has the alarm. A session whose shift is at its start has one part.
+        The part after the shift has the alarm. If the shift is at the start of the session, there
+        is only one part.
         """
         n_before = self.seconds - self.seconds_since
         if not self.since_ns or n_before <= 0:
@@ -115,8 +116,7 @@ class Digest:
 def write_digest(directory: Path, digest: Digest) -> Path:
     """Write a digest into the folder ``digests`` of an output directory, and return its path.
 
-    The name of the file is the time of the session's start, so that sorted names are in order of
-    time.
+    The file is named after the start of the session, so that sorted names are in order of time.
     """
     folder = directory / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -161,12 +161,12 @@ def read_digest(path: Path) -> Digest | None:
 def read_digests(paths: list[Path]) -> list[Digest] | None:
     """Return the digests in files and folders, in order of time.
 
-    None is returned if a path has no digests, or has a file that is no digest.
+    The result is None if a path has no digests, or has another kind of file.
 
     Raises
     ------
     InputError
-        If a digest has invalid values, or if digests are those of different mounts.
+        If a digest has invalid values, or if the digests are of different mounts.
     """
     digests = []
     for path in paths:

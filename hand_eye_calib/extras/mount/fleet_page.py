@@ -56,7 +56,7 @@ class _Row(NamedTuple):
 
 
 def render_fleet(histories: Mapping[str, History]) -> str:
-    """Return the page as HTML; vehicles with the newest change or alarm come first.
+    """Return the page as HTML. Vehicles with the newest change or alarm are first.
 
     Parameters
     ----------

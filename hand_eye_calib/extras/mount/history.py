@@ -5,8 +5,8 @@ u_k ~ N(0, W) that differs from session to session. The information H_k and the 
 digest measure this offset. If the mount changes before session c, the offset is d + s + u_k from
 session c on, with the shift s.
 
-The change is at the session c with the largest likelihood ratio of a shift against no shift, as in
-the monitor (:mod:`hand_eye_calib.extras.mount.monitor`). The sessions before and after this change
+The change is before the session c with the largest likelihood ratio of a shift against no shift, as
+in the monitor (:mod:`hand_eye_calib.extras.mount.monitor`). The sessions on each side of the change
 are then searched for further changes (binary segmentation: A. Scott, M. Knott, *A cluster analysis
 method*, 1974).
 """
@@ -32,7 +32,7 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.mount.digest import Digest
 from hand_eye_calib.extras.mount.monitor import KNOCKS, TUNING
 
-# Covariance (6, 6) of an offset about which nothing is known.
+# Covariance (6, 6) of an unknown offset.
 _UNKNOWN = np.diag(change.UNKNOWN**2)
 
 
@@ -95,8 +95,8 @@ class History:
     changes : sequence of Changepoint
         In order of time.
     offsets : sequence of Moved
-        For each digest, the offset from the installed pose by all digests since the last of the
-        cuts, along and about the axes of the parent sensor's frame.
+        For each digest, the offset from the installed pose, along and about the axes of the parent
+        sensor's frame. It is estimated from all digests since the last cut.
     """
 
     sessions: Sequence[Digest]
@@ -129,8 +129,8 @@ class History:
     def events(self) -> list[Event]:
         """Changes and alarms in order of time.
 
-        An alarm that is a change is listed once. An alarm that only repeats an earlier event,
-        because the mount had moved before the session, is not listed.
+        If an alarm is also a change, it is listed once. If the mount had moved before the session,
+        the alarm repeats an earlier event, and is not listed.
         """
         changes = {item.index: item for item in self.changes}
         events = []
@@ -193,7 +193,7 @@ def _offsets(digests: Sequence[Digest], cuts: Set[int]) -> list[change.Moved]:
     for index, digest in enumerate(digests):
         if index in cuts:
             evidence = np.zeros((6, 7))
-        # All digests since the last cut have the same offset, so their evidence is added.
+        # All digests since the last cut have one offset, so their evidence is added.
         evidence = evidence + _evidence_on_common_offset(digest)
         to_parent = se3.block_diagonal(se3.rotation_of(digest.installed))
         offsets.append(_shift_of(evidence, to_parent))
@@ -216,7 +216,7 @@ def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:
 
 
 def _evidence_on_common_offset(digest: Digest) -> FloatArray:
-    """Return the evidence ``[H S]`` (6, 7) of a session on the offset d that all sessions share.
+    """Return the evidence ``[H S]`` (6, 7) of a session on d, the offset common to all sessions.
 
     It is weaker than the evidence in the digest, because the session also has its own error u_k.
     """
@@ -239,7 +239,7 @@ def _changes(
     start : int
         Index of the first session of the sequence among all sessions.
     prior : (6, 6) array
-        Prior covariance of the offset at the begin of the sequence.
+        Prior covariance of the offset at the start of the sequence.
     to_parent : (6, 6) array
         Rotation of tangent vectors from the child's to the parent's frame.
     cuts_from : int

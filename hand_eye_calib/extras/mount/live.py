@@ -18,8 +18,8 @@ from hand_eye_calib.online.live.progress import AXIS_KEYS
 from hand_eye_calib.online.live.session import LiveSession
 from hand_eye_calib.online.live.state import Level, MountState, Outcome, by_axis
 
-# Limits of a session that is monitored but not calibrated: poses are paired soon, and few poses are
-# stored.
+# Limits of a session that is monitored instead of calibrated: poses are paired soon, and few poses
+# are stored.
 LIMITS = BufferLimits(
     capacity=4_000,
     pairing_starts=32,
@@ -30,16 +30,16 @@ LIMITS = BufferLimits(
 
 
 class MountWatch:
-    """Monitor of a live session; the node calls :meth:`look` about once a second.
+    """Monitor of a live session. The node calls :meth:`look` about once a second.
 
     Parameters
     ----------
     session : LiveSession
     installed : callable
-        ``installed(parent_frame, child_frame)`` returns the installed pose; None while this pose is
-        unknown.
+        Function ``installed(parent_frame, child_frame)`` that returns the installed pose; None
+        while it is unknown.
     why_unknown : callable
-        Returns why the installed pose is unknown, as text.
+        Function that returns the reason why the installed pose is unknown, as text.
     log : NodeLog
     """
 
@@ -59,7 +59,7 @@ class MountWatch:
         self._frames = ("", "")
 
     def restart(self) -> None:
-        """Accept earlier stamps after the stamps have jumped back; noise and evidence are kept."""
+        """Accept earlier stamps after the stamps have jumped back. Noise and evidence are kept."""
         self._last_ns = -1
         if self._monitor is not None:
             self._monitor.restart()
@@ -69,7 +69,7 @@ class MountWatch:
         calibrator = self._session.calibrator
         pairs = calibrator.take_pairs()
         pairs = pairs[pairs.stamps_ns > self._last_ns]
-        # The frames are known from the first pair on.
+        # The frames are known after the first pair.
         if self._monitor is None and len(pairs):
             snapshot = calibrator.snapshot()
             installed = self._installed(
@@ -86,7 +86,7 @@ class MountWatch:
                 self._log.error(str(alarm))
 
     def save(self, directory: Path) -> Outcome:
-        """Write the digest; return whether this succeeded, and a line about it for the user."""
+        """Write the digest. Return whether this succeeded, and a line of text for the user."""
         digest = self._monitor.digest(*self._frames) if self._monitor else None
         if digest is None:
             return (
@@ -118,7 +118,7 @@ class MountWatch:
             text = f"learning the noise: {monitor.seconds} of {TUNING.learning_s} s of motion"
         else:
             text = "the mount has not moved"
-            # Axes along which only large shifts would be detected.
+            # Axes on which only large shifts would be detected.
             limits = SEEN_TARGETS * np.array(
                 self._session.calibrator.config.targets
             )

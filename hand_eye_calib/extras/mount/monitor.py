@@ -7,14 +7,14 @@ of the scores and the prior covariance L of a shift,
     H = sum H_k / f,   S = sum S_k / f      over the last 3 s, 4 s, ... 20 min, and over all seconds
     log ratio = 1/2 S' (H + L^-1)^-1 S - 1/2 log|I + L H|
 
-An alarm is raised if the largest ratio exceeds a threshold: the generalised likelihood ratio test
-of M. Basseville, I. Nikiforov, *Detection of abrupt changes*, 1993.
+An alarm is raised if the largest ratio exceeds a threshold: generalised likelihood ratio test (M.
+Basseville, I. Nikiforov, *Detection of abrupt changes*, 1993).
 
-Even before a shift, the pose has an offset from the installed extrinsic. Its prior covariance is
+Even without a shift, the pose has an offset from the installed extrinsic. Its prior covariance is
 that of the extrinsic plus the common-mode error of both odometries
 (:mod:`hand_eye_calib.core.assessment.covariance`). The offset is estimated from the motion before
-the shift. A scale that drifts, for example of visual odometry, looks like a shift of the lever arm
-in curves. Therefore each second has a scale parameter of its own. A sensor at rest adds nothing.
+the shift. A drifting scale, such as that of visual odometry, looks like a shift of the lever arm in
+curves. Therefore each second has its own scale parameter. A sensor at rest adds no evidence.
 docs/session.md lists the shifts that the monitor detects.
 """
 
@@ -46,14 +46,14 @@ from hand_eye_calib.extras.mount.digest import Digest
 
 @dataclass(frozen=True)
 class Tuning:
-    """Numbers of the monitor. Times are seconds of motion unless stated otherwise.
+    """Constants of the monitor. Times are seconds of motion, unless stated otherwise.
 
     docs/session.md lists the shifts that are detected with these numbers.
     """
 
     # Smallest logarithm of the likelihood ratio that raises an alarm.
     threshold: float = 10.0
-    # Largest duration of a motion that should last one second (s).
+    # Longest duration of a motion that should last one second (s).
     max_motion_s: float = 1.5
     # At most one motion begins in each interval of this length (ns).
     step_ns: int = 100_000_000
@@ -67,22 +67,23 @@ class Tuning:
     learning_s: int = 120
     # Number of the newest seconds whose evidence is stored separately.
     memory_s: int = 1200
-    # Shortest tested time since a shift. It is longer than a motion, so that a single jump of a
-    # trajectory is not taken for a shift.
+    # Shortest tested time since a shift (s). It is longer than a motion, so that a single jump of a
+    # trajectory does not look like a shift.
     shortest_s: int = 3
     # Number of tested times since a shift, in geometric steps.
     lags: int = 16
-    # Time constant of the estimate of the noise.
+    # Time constant (s) of the estimate of the noise.
     noise_memory_s: float = 900.0
-    # Time constant with which evidence older than the memory decays.
+    # Time constant (s) with which evidence older than the memory decays.
     old_memory_s: float = 20_000.0
     # Factor by which the covariance of the installed extrinsic is multiplied, as a safety margin.
     covariance_factor: float = 2.0
-    # Standard deviation of the change of the common-mode error from hour to hour, as a share of the
-    # common-mode error.
+    # Standard deviation of the change of the common-mode error from hour to hour, as a share of
+    # this error.
     wander: float = 0.25
-    # Prior standard deviation of the error of the child's scale in each second. A drift of 0.5 %
-    # lasts about a minute. Independent errors of each second need sqrt(60) times that.
+    # Prior standard deviation of the scale error of the child in each second. A drift of 0.5 %
+    # lasts for about a minute; errors that are independent in each second need sqrt(60) times as
+    # much.
     scale_sigma: float = 0.04
     # Lengths (s) of the windows from whose scores the long-run variance is estimated.
     windows_s: tuple[int, ...] = (10, 30, 90, 240)
@@ -90,14 +91,14 @@ class Tuning:
     long_run_every_s: int = 10
     # Prior value of the long-run variance.
     assumed: float = 10.0
-    # Weight of the prior value, as a number of windows. With fewer windows than this, the long-run
-    # variance is not estimated.
+    # Weight of the prior value, as a number of windows. The long-run variance is estimated from at
+    # least this number of windows.
     assumed_windows: int = 4
-    # Larger scores of windows are limited to this multiple of the median, because a shift within a
+    # Scores of windows are limited to this multiple of their median, because a shift within a
     # window increases its score.
     max_of_median: float = 20.0
-    # Share of the prior information of a shift that is added to the information of the motion, to
-    # keep it regular.
+    # Share of the prior information on a shift that is added to the information from the motion, so
+    # that the sum is regular.
     ridge: float = 1e-3
     # Duration of the motion for which detectable shifts are reported.
     session_s: float = 600.0
@@ -113,8 +114,8 @@ _LAGS = (
 )
 _SECOND_NS = 1_000_000_000
 
-# Prior covariances (3, 6, 6) of shifts: only a translation, only a rotation, or both. A shift that
-# only rotates the sensor is detected sooner with the second covariance than with the third.
+# Prior covariances (3, 6, 6) of shifts: only a translation, only a rotation, or both. The second
+# covariance detects a pure rotation sooner than the third.
 KNOCKS = np.array(
     [
         moved.shift_covariance(radians=1e-6),
@@ -157,7 +158,8 @@ class Alarm:
     raised_ns : int
         Time of its detection, on the parent's clock.
     seconds_before : int
-        Duration of the motion before the shift (s); 0 if the mount had moved before all motion.
+        Duration of the motion before the shift (s); 0 if the mount was already displaced at the
+        start.
     shift : Moved
         Shift along and about the axes of the parent sensor's frame.
     log_ratio : float
@@ -195,7 +197,7 @@ class MountMonitor:
     seconds : int
         Duration of the motion so far (s).
     is_learning : bool
-        True while the first motions are collected to estimate the noise. Nothing is tested yet.
+        Whether the noise is still being estimated from the first motions. Nothing is tested yet.
     long_run : float
         Long-run variance f of the scores, relative to their variance without correlation in time.
     """
@@ -230,7 +232,7 @@ class MountMonitor:
         Returns
         -------
         Alarm or None
-            The alarm if these poses raise it; None if it was raised before.
+            The alarm that these poses raise; None if there is none, or if it was raised before.
         """
         had_alarm = self.alarm is not None
         raised = None
@@ -250,7 +252,7 @@ class MountMonitor:
         return raised
 
     def restart(self) -> None:
-        """Accept earlier stamps again; the noise and the evidence are kept."""
+        """Accept earlier stamps again. The noise and the evidence are kept."""
         self._tail = PosePairs.empty()
         self._last_s = -1
 
@@ -259,7 +261,7 @@ class MountMonitor:
     def _by_second(self, pose_pairs: PosePairs) -> list[_Second]:
         """Return the motions that the new poses complete, grouped by the second of their start.
 
-        Only complete seconds are returned. The poses of an incomplete second are stored.
+        Only complete seconds are returned. Poses of an incomplete second are stored.
         """
         if len(self._tail) and len(pose_pairs):
             gap_ns = int(pose_pairs.stamps_ns[0] - self._tail.stamps_ns[-1])
@@ -273,8 +275,8 @@ class MountMonitor:
         seconds = poses.stamps_ns // _SECOND_NS
         # A motion lasts from pose i to the first pose j that is at least one second later.
         j = np.searchsorted(stamps_ns, stamps_ns + _SECOND_NS)
-        # The second in which the last finished motion starts is incomplete: further motions may
-        # start in it. All motions that start in earlier seconds are finished.
+        # Further motions may start in the second of the last finished motion, so this second is
+        # incomplete. All motions of earlier seconds are finished.
         has_end = j < len(stamps_ns)
         incomplete_s = int(seconds[has_end][-1]) if has_end.any() else -1
         self._tail = poses[seconds >= incomplete_s]
@@ -305,7 +307,7 @@ class MountMonitor:
         return complete
 
     def _learn(self, second: _Second) -> None:
-        """Collect the first seconds. From enough seconds, estimate the noise, and begin to test.
+        """Collect the first seconds. If there are enough, estimate the noise and start to test.
 
         The noise is the scatter of the residuals about the shift that fits these seconds best.
         """
@@ -315,7 +317,8 @@ class MountMonitor:
         seconds = self._learning
         self._learning = []
         pairs = MotionPairs.concatenate(*(item.motions for item in seconds))
-        # Number the poses so that the motions count as independent, each over one step.
+        # Number the poses so that each motion is a separate step: the motions then count as
+        # independent.
         index = np.arange(len(pairs))
         pairs = replace(pairs, i=index, j=index + 1)
         residuals = np.concatenate([item.residuals for item in seconds])
@@ -348,7 +351,7 @@ class MountMonitor:
     def _add_evidence(self, second: _Second) -> None:
         """Add the evidence of a second on a shift, and update the estimate of the noise.
 
-        The scale of the child in this second is unknown, and is eliminated from the evidence.
+        The scale of the child in this second is unknown, so it is eliminated from the evidence.
         """
         n_seconds = len(self._seconds.sums)
         if (
@@ -367,7 +370,7 @@ class MountMonitor:
         table = np.delete(table[:6], 6, axis=1) - np.outer(
             table[:6, 6] / scale_information, by_scale
         )
-        # The oldest second leaves the memory. After an alarm, the old evidence must not change.
+        # The oldest second leaves the memory. After an alarm, the old evidence must stay unchanged.
         if n_seconds == TUNING.memory_s and self.alarm is None:
             self._old = (
                 1.0 - 1.0 / TUNING.old_memory_s
@@ -389,7 +392,7 @@ class MountMonitor:
     def _test(self) -> None:
         """Raise an alarm if the largest ratio exceeds the threshold.
 
-        If there is an alarm already, its shift is updated when the ratio has grown.
+        If an alarm already exists, its shift is updated when the ratio has increased.
         """
         if (
             self.seconds % TUNING.long_run_every_s == 0
@@ -438,7 +441,8 @@ class MountMonitor:
         Returns
         -------
         lags : (l,) int array
-            Seconds since the shift. The last value is the whole memory, for a shift before it.
+            Seconds since the shift. The last value is the whole memory: it represents a shift
+            before it.
         tables : (l, 6, 7) array
             Information H and score S, ``[H S]``, for each lag.
         """
@@ -456,7 +460,7 @@ class MountMonitor:
         return np.append(lags, n_seconds), tables
 
     def digest(self, parent_frame: str, child_frame: str) -> Digest | None:
-        """Return the digest of the session; None until the noise is estimated."""
+        """Return the digest of the session; None before the noise is estimated."""
         if self.is_learning:
             return None
         digest = Digest(
@@ -491,8 +495,8 @@ class MountMonitor:
         """Return the shifts (6,) that are detected in nine of ten cases.
 
         The shifts are along (m) and about (rad) each axis of the parent sensor. They are detected
-        within ``seconds`` of motion like the motion so far. All are infinite until the noise is
-        estimated.
+        within ``seconds`` of motion like the motion so far. Before the noise is estimated, all are
+        infinite.
         """
         if self.is_learning:
             return np.full(6, np.inf)
@@ -521,8 +525,8 @@ class MountMonitor:
         values, vectors = np.linalg.eigh(scale[:, None] * H * scale)
         root = scale[:, None] * vectors / np.sqrt(1.0 + np.maximum(values, 0.0))
         covariance = root @ root.T + cov_before
-        # A shift of z standard deviations has the log ratio (z^2 - log|I + L C^-1|) / 2, with the
-        # covariance C and the prior covariance L of a translation or of a rotation.
+        # A shift of z standard deviations has the log ratio (z^2 - log|I + L C^-1|) / 2: C is the
+        # covariance, and L the prior covariance of a translation or a rotation.
         volumes = np.eye(6) + KNOCKS[:2] @ np.linalg.inv(covariance)
         log_volumes = np.linalg.slogdet(volumes)[1]
         detected_sigmas = (
@@ -534,7 +538,7 @@ class MountMonitor:
 
 
 def _is_motion(motions: MotionPairs, noise: FloatArray) -> bool:
-    """Whether the sensors move in these motions. At rest, noise would look like information."""
+    """Return whether the sensors move. At rest, noise would look like information."""
     parent = motions.Ts_parenti_parentj
     angle_rad = np.median(se3.rotation_angle(se3.rotation_of(parent)))
     distance_m = np.median(np.linalg.norm(se3.translation_of(parent), axis=1))
@@ -554,7 +558,7 @@ def _evidence(
     """Return the evidence (p, p + 1) of motions on p parameters, and the scatter (6, 6).
 
     Motions with large residuals get smaller weights. Weights and scatter are computed from the
-    residuals that remain with the parameters ``shift`` (p,), zero by default.
+    residuals after the parameters ``shift`` (p,), which are zero by default.
     """
     centred = residuals if shift is None else residuals + jacobians @ shift
     squared = np.einsum("ki,ki->k", centred @ np.linalg.inv(noise), centred)
@@ -567,8 +571,8 @@ def _evidence(
 def _long_run_variance(seconds: Blocks, previous: float) -> float:
     """Return the long-run variance of the scores, relative to the variance without correlation.
 
-    For windows of several lengths, the squared scores about the best shift are averaged, and the
-    largest mean is used. With too few windows of every length, ``previous`` is returned.
+    For windows of several lengths, the mean of the squared scores about the best shift is computed.
+    The largest mean is used. If all lengths have too few windows, ``previous`` is returned.
     """
     shift = moved.most_likely(seconds.total, TUNING.ridge)
     prior = TUNING.assumed_windows * TUNING.assumed
