@@ -50,6 +50,8 @@ _MOVING_SHARE = 0.3
 # Smallest share of its displacements that another part must leave unexplained.
 _OTHER_SHARE = 0.25
 _OTHER_FACTOR = 3.0
+# An extrinsic explains a part if it leaves at most this share of its displacements unexplained.
+_EXPLAINED_SHARE = _OTHER_SHARE / _OTHER_FACTOR
 
 # Quantile of the residuals that is compared. It must lie in the smaller part.
 _EXCHANGE_QUANTILE = 0.85
@@ -114,12 +116,14 @@ def check_other_extrinsic(
         se3.translation_of(motions.Ts_parenti_parentj), axis=1
     )
     motions = motions[lengths_m > _MOVING_SHARE * median(lengths_m)]
-    if (
-        len(motions) < MIN_PAIRS
-        or (_unexplained_path(motions, X) < _OTHER_SHARE).all()
-    ):
+    if len(motions) < MIN_PAIRS:
         return []
+    shares = _unexplained_path(motions, X)
     block_of = motions.i * _EXCHANGE_BLOCKS // len(pose_pairs)
+    # If X explains all blocks, another extrinsic that explains the ends explains them, too.
+    is_one_part = max(_usual_shares(shares, block_of)) < _EXPLAINED_SHARE
+    if is_one_part or (shares < _OTHER_SHARE).all():
+        return []
     ends = (block_of < _END_BLOCKS, block_of >= _EXCHANGE_BLOCKS - _END_BLOCKS)
     fits = [_own_fit(motions[is_end]) for is_end in ends]
     for candidate in (X, *(fit.T_parent_child for fit in fits if fit)):
@@ -132,10 +136,7 @@ def check_other_extrinsic(
         row = cut * len(pose_pairs) // _EXCHANGE_BLOCKS
         at_s = _seconds_at(pose_pairs.stamps_ns, row)
         exchanged = _exchanged(motions[is_other])
-        if (
-            median(_unexplained_path(exchanged, candidate))
-            < _OTHER_SHARE / _OTHER_FACTOR
-        ):
+        if median(_unexplained_path(exchanged, candidate)) < _EXPLAINED_SHARE:
             return [finding("exchanged", at_s=at_s)]
         return [_parts_turned(candidate, own.T_parent_child, at_s)]
     return []
@@ -186,9 +187,15 @@ def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
         return None
     is_sound = (
         median(_unexplained_path(motions, fit.T_parent_child))
-        < _OTHER_SHARE / _OTHER_FACTOR
+        < _EXPLAINED_SHARE
     )
     return fit if is_sound else None
+
+
+def _usual_shares(shares: FloatArray, block_of: IntArray) -> FloatArray:
+    """Return the median share of the motions of each block that has motions."""
+    blocks = np.unique(block_of)
+    return np.array([median(shares[block_of == block]) for block in blocks])
 
 
 def _other_part(
@@ -200,7 +207,7 @@ def _other_part(
     the motions. The mask is empty if no part differs clearly.
     """
     blocks = np.unique(block_of)
-    usual = np.array([median(shares[block_of == block]) for block in blocks])
+    usual = _usual_shares(shares, block_of)
     best = _OTHER_FACTOR
     cut = 0
     is_other = np.zeros(len(shares), dtype=bool)
