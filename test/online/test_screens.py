@@ -329,6 +329,9 @@ SCREENS = {
     "ended": replace(
         state(extrinsic=GOOD, at=DONE, saved=SAVED), has_ended=True
     ),
+    "ended before it was confirmed": replace(
+        state(extrinsic=GOOD, saved=SAVED), has_ended=True
+    ),
     "ended with care": replace(
         state(
             extrinsic=CARE,

@@ -375,15 +375,16 @@ def test_an_axis_measured_by_hand_is_sent(page):
 def test_the_form_names_the_pose_and_replaces_the_option(page):
     reason = "measure it by hand and give a prior, such as prior.z 0.50+/-0.02"
     shown = replace(GO_ON, word="MEASURE", reasons=(reason, "c: d"))
-    pose = replace(shown, title="pose of camera in lidar", values=(("z", "?"),))
+    pose = replace(shown, pose_of="of camera in lidar", values=(("z", "?"),))
     page.show(replace(pose, by_hand=("z",)))
     assert page.get("#pose-of", "textContent") == "of camera in lidar"
     text = page.get(".health", "innerText")
     assert "measure it by hand and type it above\nc: d" in text
-    # Without the form, the option is necessary.
+    # Without the form, the driver can only change the motion.
     page.show(replace(shown, word="GO ON"))
     assert page.get("#pose-of", "textContent") == ""
-    assert reason in page.get(".health", "innerText")
+    text = page.get(".health", "innerText")
+    assert "measure it by hand or change the motion\nc: d" in text
 
 
 def test_the_unit_and_the_button_to_remove_follow_the_axis(page):

@@ -248,7 +248,7 @@ def _with_axis_of(
     # The errors of the other axes are correlated with the error of this axis. Shift them by their
     # regression on this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
-    warning = f"{axis} is that of the installed transform ({installed.origin})"
+    warning = f"{axis} is that of the installed transform"
     return replace(
         calibration, T_parent_child=T, warnings=(*calibration.warnings, warning)
     )

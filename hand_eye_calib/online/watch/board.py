@@ -220,12 +220,13 @@ def _view(state: NodeState, silent_s: float) -> View:
 
 def _with_result(view: View, state: NodeState) -> View:
     """Add the result to the view of a calibrating node. A refuted result has no pose."""
-    view = replace(view, result=tuple(_result(state, view.word)))
+    view = replace(view, result=tuple(_result(state, view)))
     if result := state.result:
-        view = replace(view, reasons=result.reasons)
+        pose_of = f"of {result.child_frame} in {result.parent_frame}"
+        view = replace(view, reasons=result.reasons, pose_of=pose_of)
         if state.standing is not Standing.REFUTED:
-            title = f"pose of {result.child_frame} in {result.parent_frame}"
-            view = replace(view, title=title, values=tuple(pose_values(result)))
+            values = tuple(pose_values(result))
+            view = replace(view, title=f"pose {pose_of}", values=values)
     return view
 
 
@@ -339,10 +340,10 @@ def _tone_of(part: Part) -> Tone:
     return tone
 
 
-def _result(state: NodeState, word: str) -> Iterator[Line]:
+def _result(state: NodeState, view: View) -> Iterator[Line]:
     """Yield the lines of the result: verdict, warnings, priors, comparison, broadcast and files.
 
-    ``word`` is the status on the board. At the end, warnings are followed by lines with evidence.
+    ``view`` has the headline. When a session is DONE, lines with evidence follow the warnings.
     """
     result = state.result
     verdict = result.verdict if result else "no result yet"
@@ -351,7 +352,7 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", typeset(warning))
         # The reasons of another verdict contain the same numbers.
-        if word == DONE and result.verdict == "USE":
+        if view.word == DONE and result.verdict == "USE":
             for fact in result.facts:
                 yield Line(Tone.GOOD, "evidence", typeset(fact))
     yield from _prior_lines(state)
@@ -365,7 +366,10 @@ def _result(state: NodeState, word: str) -> Iterator[Line]:
     if state.extrinsic and state.extrinsic.tf_static is not Broadcast.OFF:
         yield _broadcast(state.extrinsic, state.has_ended)
     if state.saved:
-        tone = _TONES.get(state.saved.verdict, Tone.GOOD)
+        # At the end, the headline is about the saved result.
+        tone = view.tone
+        if not state.has_ended:
+            tone = _TONES.get(state.saved.verdict, Tone.GOOD)
         yield Line(
             tone, "saved", f"{saved_at(state.saved)}: {state.saved.text}"
         )

@@ -322,10 +322,9 @@ def _at_goal(state: NodeState, session: ProgressState) -> Headline:
         tone = Tone.ACT
         sentence = caution
         steps = ["" if state.saved else "Save.", result.step]
-    if result and session.comparison and session.comparison.verdict == "moved":
+    if moved := _moved(state):
         tone = Tone.ACT
-        displacement = _displacement(session.comparison.differences[0])
-        sentence = f"{result.child_frame} HAS MOVED by {displacement}."
+        sentence = moved
         steps = ["" if state.saved else "Save.", caution]
     if state.saved:
         sentence = f"{sentence} Saved at {_time_of(state.saved)}."
@@ -338,6 +337,17 @@ def _caution(result: ResultState) -> str:
     if result.verdict == "USE":
         return ""
     return f"{result.verdict}: {result.caution or 'read the reasons below'}."
+
+
+def _moved(state: NodeState) -> str:
+    """Return how far the sensor has moved against the installed transform; empty if it has not."""
+    comparison = state.progress.comparison if state.progress else None
+    if state.result is None or comparison is None:
+        return ""
+    if comparison.verdict != "moved":
+        return ""
+    displacement = _displacement(comparison.differences[0])
+    return f"{state.result.child_frame} HAS MOVED by {displacement}."
 
 
 def _displacement(difference: Difference) -> str:
@@ -402,6 +412,15 @@ def _end(state: NodeState) -> Headline:
         return Headline(
             Tone.ACT, "ENDED", f"{caution} {saved_text}", state.result.step
         )
+    if state.progress is not None and not state.progress.progress.done:
+        return Headline(
+            Tone.ACT,
+            "ENDED",
+            f"{saved_text} It was not confirmed yet.",
+            "Record longer, until DONE.",
+        )
+    if moved := _moved(state):
+        return Headline(Tone.ACT, "ENDED", f"{moved} {saved_text}")
     return Headline(Tone.GOOD, "ENDED", f"{text}. {saved_text}")
 
 

@@ -86,6 +86,8 @@ class View:
         Next action; empty if the sentence contains it.
     facts : str
         Amount of motion, and age of the result.
+    pose_of : str
+        Frames of the pose in words, "of CHILD in PARENT"; empty without a result.
     title : str
         Name of the pose in ``values``.
     values : tuple of (str, str)
@@ -122,6 +124,7 @@ class View:
     sentence: str
     advice: str = ""
     facts: str = ""
+    pose_of: str = ""
     title: str = ""
     values: AxisTexts = ()
     bars: tuple[Bar, ...] = ()

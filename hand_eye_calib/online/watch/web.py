@@ -325,14 +325,18 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
     ]
     # The first line of the result is the verdict. The reasons for the verdict follow it.
     reasons = _listed(view.reasons)
-    if view.by_hand:
-        reasons = _PRIOR_ADVICE.sub("and type it above", reasons)
+    # Without a form, the motion must change.
+    replacement = (
+        "and type it above" if view.by_hand else "or change the motion"
+    )
+    reasons = _PRIOR_ADVICE.sub(replacement, reasons)
     health = _lines(view.result[:1]) + reasons
     health += _lines(view.result[1:] + view.health)
     return (
         f'<div id="state" class="{view.tone.name.lower()}" data-buttons="{" ".join(view.buttons)}" '
         f'data-asked="{view.asked}" '
         f'data-by-hand="{" ".join(view.by_hand)}" '
+        f'data-pose-of="{escape(view.pose_of)}" '
         f'data-priors="{escape(json.dumps(dict(view.priors)))}" '
         f'data-files="{" ".join(files)}">'
         + _element("p", view.node or "no node", "node")

@@ -67,9 +67,7 @@ function display(html) {
   }
   footer.hidden = [...footer.children].every((button) => button.hidden);
   element("files").hidden = state.dataset.files === "";
-  // The title is "pose of CHILD in PARENT", with the names of the frames.
-  const title = view.querySelector(".pose h2")?.textContent || "";
-  element("pose-of").textContent = title.replace(/^pose /, "");
+  element("pose-of").textContent = state.dataset.poseOf;
   offerAxes(state.dataset.byHand.split(" ").filter(Boolean), JSON.parse(state.dataset.priors));
   for (const link of links) {
     link.hidden = !state.dataset.files.split(" ").includes(link.dataset.file);
