@@ -39,6 +39,7 @@ from hand_eye_calib.online.live.goal import no_result_in_words
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
 from hand_eye_calib.online.live.state import Level, Standing
 from hand_eye_calib.online.watch import terminal
+from hand_eye_calib.online.watch.view import Tone
 from hand_eye_calib.online.watch.web import fragment
 
 
@@ -444,3 +445,40 @@ def test_the_rules_find_a_screen_that_contradicts_itself(name):
     view = view_of(document)
     assert not list(faults_of(view, document))
     assert list(faults_of(replace(view, **fields), document))
+
+
+def moved_by(metres):
+    """A comparison with the installed transform: z has changed."""
+    unmoved = AxisDifference(
+        difference=0.0, sigma=0.004, visible=0.01, verdict="same"
+    )
+    z = replace(unmoved, difference=metres, verdict="moved")
+    axes = dict.fromkeys(AXIS_KEYS.values(), unmoved) | {"z": z}
+    difference = Difference(
+        first="a", second="b", verdict="moved", sentence="", axes=axes
+    )
+    return Comparison(
+        sentence="moved", verdict="moved", differences=(difference,)
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "tone", "start"),
+    [
+        ({"at": DONE}, Tone.GOOD, "The node has ended. The result was saved"),
+        ({}, Tone.ACT, "The result was saved at "),
+        (
+            {"at": DONE, "comparison": moved_by(0.15)},
+            Tone.ACT,
+            "camera HAS MOVED by 15 cm. The result was saved at ",
+        ),
+    ],
+    ids=["done", "not confirmed", "moved"],
+)
+def test_the_end_states_what_the_saved_result_is(parts, tone, start):
+    ended = replace(state(extrinsic=GOOD, saved=SAVED, **parts), has_ended=True)
+    view = view_of(ended)
+    assert (view.word, view.tone) == ("ENDED", tone)
+    assert view.sentence.startswith(start)
+    assert ("confirmed" in view.sentence) == (not parts)
+    assert list(faults_of(view, ended)) == []

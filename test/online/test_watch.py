@@ -274,13 +274,6 @@ def test_a_state_with_any_wrong_value_is_shown_or_left_out(kind, hostile):
                 "The node has ended. The result was saved at ",
             ),
         ),
-        (
-            replace(state(), has_ended=True, saved=SAVED),
-            9.0,
-            Tone.ACT,
-            "ENDED",
-            "The result was saved at ",
-        ),
     ],
 )
 def test_the_headline_is_what_a_person_should_do_first(
@@ -392,14 +385,6 @@ def test_verdict_reasons_and_comparison_have_a_sign():
     assert (view.word, view.tone, view.buttons[0]) == ("DONE", Tone.ACT, "save")
     # Distance and angle of the axes that have moved; the bars contain each of them.
     assert view.sentence == "camera HAS MOVED by 5.4 cm and 2.5 deg."
-    ended = replace(
-        state(comparison=comparison, saved=SAVED, **done), has_ended=True
-    )
-    end = view_of(ended)
-    assert (end.word, end.tone) == ("ENDED", Tone.ACT)
-    assert end.sentence.startswith(
-        "camera HAS MOVED by 5.4 cm and 2.5 deg. The result was saved at "
-    )
     assert view.advice == "Save. USE WITH CARE: z might be wrong."
     assert view_of(state(**done)).text == "Known. Stop and save."
     saved = view_of(replace(state(**done), saved=SAVED))

@@ -420,7 +420,12 @@ def _end(state: NodeState) -> Headline:
             "Record longer, until DONE.",
         )
     if moved := _moved(state):
-        return Headline(Tone.ACT, "ENDED", f"{moved} {saved_text}")
+        return Headline(
+            Tone.ACT,
+            "ENDED",
+            f"{moved} {saved_text}",
+            "Check the mount, then install this result.",
+        )
     return Headline(Tone.GOOD, "ENDED", f"{text}. {saved_text}")
 
 
