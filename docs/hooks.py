@@ -12,6 +12,8 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).resolve().parents[1]
 ROOT_PAGES = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md")
 LINKED_FILES = ("config/calibrator.yaml",)
+# Factor of the search scores of the Python reference, whose names resemble words of questions.
+REFERENCE_BOOST = 0.2
 
 
 def on_files(files, config):
@@ -58,6 +60,8 @@ def on_page_markdown(markdown, page, config, **_):
     source = page.file.src_uri
     if config.not_in_nav.match_file(source) or source == "CHANGELOG.md":
         page.meta["search"] = {"exclude": True}
+    if source == "python.md":
+        page.meta["search"] = {"boost": REFERENCE_BOOST}
     if page.file.src_uri in ROOT_PAGES:
         return markdown.replace("](docs/", "](")
     out = "../" * (page.file.src_uri.count("/") + 1)
