@@ -328,10 +328,12 @@ def simulated(session, seed):
     )
     if session.accident:
         session.accident(streams)
+    # Jumps belong to the time, not to the messages: a fast odometry does not jump more often.
+    jumps_per_pose = REALISTIC.outliers * HILLY_DRIVE.parent_rate / parent_hz
     streams.Ts_parent, streams.Ts_child = add_noise(
         streams.Ts_parent,
         streams.Ts_child,
-        REALISTIC,
+        dataclasses.replace(REALISTIC, outliers=jumps_per_pose),
         np.random.default_rng(seed),
     )
     return streams, drive.T_parent_child

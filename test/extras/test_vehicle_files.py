@@ -85,6 +85,11 @@ def test_command_line_without_wheels(tmp_path, capsys):
     assert document["time_offset_s"] == pytest.approx(0.0, abs=1e-12)
     assert document["time_offset_sigma_s"] == 0.0
     assert main(["calibrate", lidar, lidar, "--on-vehicle"]) == 2
+    bag = tmp_path / "drive.bag"
+    bag.write_bytes(b"#ROSBAG V2.0")
+    capsys.readouterr()
+    assert main(["calibrate", str(bag), "--on-vehicle"]) == 2
+    assert "is a bag: --on-vehicle takes" in capsys.readouterr().err
 
 
 def test_odometry_of_a_bag(tmp_path):

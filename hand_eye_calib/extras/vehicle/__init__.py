@@ -33,7 +33,7 @@ def register() -> None:
 
     A registered function imports its module only when it is called.
     """
-    needs = "wheels need the poses of a sensor"
+    needs = "wheels need the poses of a sensor, such as lidar odometry"
     for word in (
         "wheels",
         "wheel_odometry",

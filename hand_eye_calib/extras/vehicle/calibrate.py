@@ -4,6 +4,7 @@ from argparse import Namespace
 from dataclasses import replace
 from typing import Any
 
+from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration
@@ -70,6 +71,13 @@ def _driving(sensor: Trajectory) -> Trajectory:
 
 def calibrate_alone(arguments: Namespace) -> int:
     """Calibrate the sensor of a trajectory file on its vehicle, and return the exit code."""
+    (path,) = arguments.paths
+    if reading.looks_like_bag(path):
+        raise ConfigError(
+            f"{path} is a bag: --on-vehicle takes the trajectory file of one sensor. Choose the "
+            "wheels and the sensor with --parent-topic and --child-topic, or write the sensor's "
+            "poses into a file"
+        )
     options = options_from(arguments)
     files = reading.read_files(arguments, arguments.paths, options)
     note(*files.repairs)

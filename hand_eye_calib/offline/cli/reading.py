@@ -105,7 +105,7 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
     local_bags = [
         path
         for path in paths
-        if isinstance(path, Path) and _looks_like_bag(path)
+        if isinstance(path, Path) and looks_like_bag(path)
     ]
     n_bags = len(urls) + len(local_bags)
     # If a single path does not exist, opening it as a bag reports the error.
@@ -161,7 +161,7 @@ def is_plain_file(path: Path | str) -> bool:
     )
 
 
-def _looks_like_bag(path: Path) -> bool:
+def looks_like_bag(path: Path) -> bool:
     """Return whether a path is a folder, or has the name of a bag's file."""
     return has_suffix_of_bag(path) or path.is_dir()
 
