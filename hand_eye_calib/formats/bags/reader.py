@@ -198,7 +198,9 @@ class PoseBag:
         """
         if isinstance(source, TfSource):
             if not self._tf_topics():
-                raise InputError(f"no transforms in {self}. {self._listing()}")
+                raise InputError(
+                    f"no transforms in {self}: name topics with poses instead. {self._listing()}"
+                )
             return
         topic, _, fields = source.partition("?")
         topics = self._parts_of(topic)
