@@ -5,6 +5,7 @@ comparisons.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -81,27 +82,23 @@ def _choices(
 
 
 def _numbers(choices: Sequence[Choice], table: Table) -> pd.DataFrame:
-    """A row for every plotted point."""
-    return pd.DataFrame(
-        {
-            **dict(
-                zip(
-                    _POINT,
-                    (dataset, level, method, reference, metric),
-                    strict=True,
-                )
-            ),
-            "statistic": "mean" if dataset != "mixture" else "median",
-            "centre": found.centre,
-            "low": found.low,
-            "high": found.high,
-            "runs": found.n,
-        }
-        for dataset, method, reference in choices
-        for level in table.levels(dataset, method)
-        for metric in METRICS
-        for found in [table.summary(dataset, level, method, reference, metric)]
-    )
+    """Return a row for each plotted point."""
+    rows = []
+    for dataset, method, reference in choices:
+        statistic = "mean" if dataset != "mixture" else "median"
+        for level, metric in product(table.levels(dataset, method), METRICS):
+            point = (dataset, level, method, reference, metric)
+            summary = table.summary(*point)
+            row = dict(zip(_POINT, point, strict=True))
+            row |= {
+                "statistic": statistic,
+                "centre": summary.centre,
+                "low": summary.low,
+                "high": summary.high,
+                "runs": summary.n,
+            }
+            rows.append(row)
+    return pd.DataFrame(rows)
 
 
 def _where(number: str, results: Results) -> tuple[str, str]:

@@ -227,28 +227,32 @@ def parts_row(rig: Rig, name: str, method: str) -> Row:
 
 
 def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
-    """Squared scatter over mean stated variance of each axis that all answers observe, once per
-    degree of freedom.
+    """Return, by axis, the variance of the answers divided by their mean stated variance.
+
+    Axes that an answer does not observe are left out. N answers have N - 1 degrees of freedom, so
+    the ratio of an axis has N - 1 entries, numbered from 0.
     """
-    good = [result for result in answers if result is not None]
-    if len(good) < len(answers) or len(good) < 2:
+    results = [result for result in answers if result is not None]
+    if len(results) < len(answers) or len(results) < 2:
         return {}
-    is_comparable = np.logical_and.reduce([_knows(result) for result in good])
-    sigmas = np.array([result.sigmas_measured for result in good])
-    variances = np.where(is_comparable, sigmas, 1.0) ** 2
-    first = good[0].T_parent_child
+    is_observed = np.logical_and.reduce([_knows(result) for result in results])
+    sigmas = np.array([result.sigmas_measured for result in results])
+    variances = np.where(is_observed, sigmas, 1.0) ** 2
+    first = results[0].T_parent_child
     deviations = np.array(
-        [deviation(result.T_parent_child, first) for result in good]
+        [deviation(result.T_parent_child, first) for result in results]
     )
     ratios = deviations.var(axis=0, ddof=1) / variances.mean(axis=0)
-
-    cases = {}
-    for row, axis in enumerate(AXES):
-        if not is_comparable[row]:
-            continue
-        for freedom in range(len(good) - 1):
-            cases[f"{axis}/{freedom}"] = float(ratios[row])
-    return cases
+    ratio_of_axis = dict(zip(AXES, ratios.tolist(), strict=True))
+    observed_axes = [
+        axis for axis, is_used in zip(AXES, is_observed, strict=True) if is_used
+    ]
+    degrees_of_freedom = range(len(results) - 1)
+    return {
+        f"{axis}/{number}": ratio_of_axis[axis]
+        for axis in observed_axes
+        for number in degrees_of_freedom
+    }
 
 
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:

@@ -185,22 +185,16 @@ def delay_table(delays_measured: Sequence[Delay]) -> str:
     for kind, size in dict.fromkeys(
         (delay.kind, delay.size) for delay in delays_measured
     ):
-        some = [
+        delays = [
             delay
             for delay in delays_measured
             if (delay.kind, delay.size) == (kind, size)
         ]
-        # A value of at most 1: the monitor said beforehand that ten minutes show this shift.
-        announced, others = (
-            np.array(
-                [
-                    delay.seconds
-                    for delay in some
-                    if (delay.announced <= 1.0) == is_said
-                ]
-            )
-            for is_said in (True, False)
-        )
+        seconds = np.array([delay.seconds for delay in delays])
+        # The monitor announced that ten minutes would reveal a shift of this size.
+        is_announced = np.array([delay.announced <= 1.0 for delay in delays])
+        announced = seconds[is_announced]
+        others = seconds[~is_announced]
         words = ["-", "-"]
         if len(announced):
             quantiles = np.quantile(announced, [0.5, 0.9], method="higher")
@@ -212,7 +206,7 @@ def delay_table(delays_measured: Sequence[Delay]) -> str:
             {
                 "motion": kind,
                 "shift": size,
-                "said to be seen": f"{len(announced)} of {len(some)}",
+                "said to be seen": f"{len(announced)} of {len(delays)}",
                 "median (s)": words[0],
                 "90 % (s)": words[1],
                 "others seen": f"{int(np.isfinite(others).sum())} of {len(others)}",

@@ -138,10 +138,10 @@ def tables(rigs: Sequence[Recorded], seed: int) -> str:
             pairs = pairs + 1
             moved = moved + (compare(couple).verdict == "moved")
     return (
-        f"{markdown_table(rows)}\n\nOf {cases} sets of three or six recordings, one of them with "
-        f"the mount knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg, that one "
-        f"is named in {named}, another in {wrong}. Of {several} sets as they are, one or more is "
-        f"named in {accused}. `compare` calls {moved} of {pairs} pairs moved."
+        f"{markdown_table(rows)}\n\nIn {cases} sets of three or six recordings, the mount of one "
+        f"recording was knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg. This "
+        f"recording is named in {named} sets, another one in {wrong}. In {several} sets without a "
+        f"knock, a recording is named in {accused}. `compare` calls {moved} of {pairs} pairs moved."
     )
 
 

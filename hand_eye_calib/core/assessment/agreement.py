@@ -318,18 +318,19 @@ def _explain(
     if n_results < 3:
         kind = kind if n_results == 2 else "single"
         return _Explanation(kind, apart, total_chi2, int(total_dof), p_value)
-    since = np.arange(2, n_results - 1)
-    p_values = _p_values_of_splits(products, ranks, since)
+    first_after_move = np.arange(2, n_results - 1)
+    p_values = _p_values_of_splits(products, ranks, first_after_move)
     best = int(np.argmin(p_values))
     # The best of several splits is tested, so its p-value is multiplied by their number
     # (Bonferroni).
     if len(p_values) * p_values[best] < level:
+        # The first N splits separate a single result, the others the results after a move.
         if best < n_results:
             kind = "one off"
             apart = number == best
         else:
             kind = "moved"
-            apart = number >= since[best - n_results]
+            apart = number >= first_after_move[best - n_results]
     elif kind == "differ" and total_chi2 < _FACTORS[-1] ** 2 * total_dof:
         # A scatter of at most the largest factor times the usual scatter explains chi-square.
         kind = "scatter"

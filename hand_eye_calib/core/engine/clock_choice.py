@@ -72,14 +72,14 @@ def clock_is_off(first: Attempt) -> bool:
     """Return whether poses must be paired anew, because the time offset has changed too much."""
     snapshot = first.snapshot
     calibration = first.calibration
-    moved_s = abs(
-        calibration.time_offset_s - float(snapshot.resolved.config.time_offset)
-    )
-    clock = first.check.offset
-    is_free = not METHODS[snapshot.config.method].uses_reference
-    if clock and is_free and snapshot.config.reference == "auto":
+    paired_with_s = float(snapshot.resolved.config.time_offset)
+    change_s = abs(calibration.time_offset_s - paired_with_s)
+    by_check = first.check.offset
+    uses_all_poses = not METHODS[snapshot.config.method].uses_reference
+    if by_check and uses_all_poses and snapshot.config.reference == "auto":
         # Only the check estimates a clock rate. For DNLO, only the check estimates the offset.
-        largest_s = clock.largest_s(snapshot.unpaired[1].duration_s)
-        if clock.spread_s < _CLEAR_SPREAD * largest_s:
-            moved_s = max(moved_s, largest_s - _CLEAR_SPREAD * clock.spread_s)
-    return moved_s >= kind_of(snapshot.config).least_clock_change_s
+        largest_s = by_check.largest_s(snapshot.unpaired[1].duration_s)
+        if by_check.spread_s < _CLEAR_SPREAD * largest_s:
+            certain_s = largest_s - _CLEAR_SPREAD * by_check.spread_s
+            change_s = max(change_s, certain_s)
+    return change_s >= kind_of(snapshot.config).least_clock_change_s

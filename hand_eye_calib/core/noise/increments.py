@@ -174,9 +174,10 @@ def course_of(
 def _smooth_steps(
     steps: FloatArray, intervals_s: FloatArray, noise_m2: float
 ) -> FloatArray:
-    """Move each step i (n, 3) towards the mean velocity of the steps i - 2 and i + 2.
+    """Move each step i (n, 3) towards the step with the mean velocity of steps i - 2, i + 2.
 
-    Its difference from this mean is multiplied by the part of the median square that is not noise.
+    Only a share of the difference between the step and this mean is kept: the share of its median
+    square that exceeds the noise variance.
     """
     velocities = steps / intervals_s[:, None]
     padded = np.pad(velocities, ((2, 2), (0, 0)), mode="edge")

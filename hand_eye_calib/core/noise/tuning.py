@@ -100,8 +100,8 @@ class Tuning:
     # Prior standard deviations of errors that are present, in the order of PARAMETERS: scale, bias
     # along each axis (m/m), time offset (s), bias of angular rates along each axis (rad/s).
     sizes: tuple[float, ...] = (0.03, 0.03, 0.03, 0.03, 0.1, 1.0, 1.0, 1.0)
-    # Prior standard deviations before errors are selected. Biases are usually small, so theirs are
-    # smaller.
+    # Prior standard deviations before errors are selected. Biases are usually
+    # small.
     first_sizes: tuple[float, ...] = (
         0.03,
         0.0026,

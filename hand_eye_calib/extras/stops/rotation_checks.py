@@ -5,7 +5,7 @@ of the angles between all stops are equal for parent and child. They differ if t
 belong together, or if Euler angles were read as rotation vectors.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -306,27 +306,30 @@ def check_angles(poses: StopPoses) -> Iterator[Finding]:
     are_equal = difference_rad < MAX_UNEXPLAINED * MIN_TURN_RAD
     if are_equal or difference_rad < SMALL_UNEXPLAINED * turn_rad:
         return
-    within_rad = min(
+    # Another kind must reduce the difference clearly, and leave little of the rotation unexplained.
+    limit_rad = min(
         difference_rad / MIN_IMPROVEMENT, MAX_UNEXPLAINED * turn_rad
     )
     kinds = [
         *_other_kinds(sample, "parent", of_child),
         *_other_kinds(sample, "child", of_parent),
     ]
-    agreeing = [kind for kind in kinds if kind.difference_rad < within_rad]
+    agreeing = [kind for kind in kinds if kind.difference_rad < limit_rad]
     if agreeing:
-        smallest_rad = min(kind.difference_rad for kind in agreeing)
-        best = [
-            kind
-            for kind in agreeing
-            if kind.difference_rad <= _MAX_EQUAL_RATIO * smallest_rad
-        ]
-        chosen = min(best, key=lambda kind: kind.unexplained_share)
-        yield finding("angles", chosen.stream, detail=chosen.text)
+        best = _best_kind(agreeing)
+        yield finding("angles", best.stream, detail=best.text)
     elif difference_rad > MIN_TURN_RAD and _are_unrelated(of_parent, of_child):
         yield finding(
             "unrelated_stops", off_deg=float(np.degrees(difference_rad))
         )
+
+
+def _best_kind(kinds: Sequence[_AngleKind]) -> _AngleKind:
+    """Return the kind of angles with the best fit, among kinds that agree about equally well."""
+    smallest_rad = min(kind.difference_rad for kind in kinds)
+    limit_rad = _MAX_EQUAL_RATIO * smallest_rad
+    equal = [kind for kind in kinds if kind.difference_rad <= limit_rad]
+    return min(equal, key=lambda kind: kind.unexplained_share)
 
 
 def _other_kinds(

@@ -530,10 +530,10 @@ def _is_helpful(motion: Excitation, axis: str) -> bool:
     The rotations about the two other axes observe an axis. The axis with the most rotation is left
     out, because every drive has this rotation.
     """
-    main = int(np.argmax(motion.rotation))
-    index = AXES.index(axis) % 3
-    others = [other for other in range(3) if other not in (index, main)]
-    return bool(motion.rotation[others].max() >= MIN_ROTATION)
+    main_axis = int(np.argmax(motion.rotation))
+    own_axis = AXES.index(axis) % 3
+    useful = [k for k in range(3) if k not in (own_axis, main_axis)]
+    return bool(motion.rotation[useful].max() >= MIN_ROTATION)
 
 
 def _turns_about(motion: Excitation, axis: str) -> bool:
