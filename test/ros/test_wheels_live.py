@@ -13,8 +13,10 @@ from std_msgs.msg import String
 import hand_eye_calib as hec
 from reproduction.machines import simulate_machine
 
-# Number of rows of wheel data whose mean is one message. With fewer rows, the queues overflow.
+# Number of rows of wheel data whose mean is one message: 10 Hz, the rate of the poses.
 ROWS = 5
+# Messages that are sent before the node must have received them; its queues are longer.
+MESSAGES_A_PART = 500
 LEFT_AND_RIGHT = ("wheel_left_joint", "wheel_right_joint")
 
 
@@ -102,18 +104,36 @@ def rows(stream):
 
 
 def publish(peer, messages, machine):
-    """Publish messages of wheels and the poses of the sensor in the order of their stamps."""
+    """Publish messages of wheels and the poses of the sensor in the order of their stamps.
+
+    The next part is sent when the node has received the former: a burst of all would exceed the
+    queues.
+    """
     publishers = peer.publishers(type(messages[0]), Odometry)
     peer.wait_matched(*publishers)
+    states = peer.listen(String, "progress")
     poses = [message(Odometry, *row, "lidar") for row in rows(machine.sensor)]
-    queue = [(publishers[0], item) for item in messages]
-    queue += [(publishers[1], item) for item in poses]
+    queue = [("parent", item) for item in messages]
+    queue += [("child", item) for item in poses]
 
     def stamp(row):
         return row[1].header.stamp.sec, row[1].header.stamp.nanosec
 
-    for publisher, item in sorted(queue, key=stamp):
-        publisher.publish(item)
+    queue.sort(key=stamp)
+    publisher_of = dict(zip(("parent", "child"), publishers, strict=True))
+    n_sent = {"parent": 0, "child": 0}
+
+    def have_arrived():
+        """Whether the node has received all that was sent."""
+        inputs = json.loads(states[-1].data)["inputs"] if states else {}
+        n_received = {name: row["messages"] for name, row in inputs.items()}
+        return n_received == n_sent
+
+    for start in range(0, len(queue), MESSAGES_A_PART):
+        for name, item in queue[start : start + MESSAGES_A_PART]:
+            publisher_of[name].publish(item)
+            n_sent[name] += 1
+        peer.spin_until(have_arrived, "all messages")
 
 
 # Model of the machine, kind of wheel data, messages, and the parameter to look at.
@@ -141,23 +161,7 @@ def test_wheels_as_parent(start_node, peer, tmp_path, case):
         *RELIABLE_INPUTS,
     )
     transforms = peer.listen(TransformStamped, "extrinsic")
-    states = peer.listen(String, "progress")
     publish(peer, make_messages(machine), machine)
-
-    def have_arrived():
-        """Whether both inputs have messages, and no more in the last states."""
-        inputs = [json.loads(state.data)["inputs"] for state in states[-3:]]
-        numbers = [
-            {name: part["messages"] for name, part in state.items()}
-            for state in inputs
-        ]
-        return (
-            len(numbers) == 3
-            and numbers[0] == numbers[2]
-            and all(numbers[0].values())
-        )
-
-    peer.spin_until(have_arrived, "all messages")
     assert peer.trigger("solve").success
     peer.spin_until(lambda: transforms, "the extrinsic")
     errors_m = (matrix(transforms[-1]) - machine.T_base_sensor)[:2, 3]
