@@ -151,12 +151,12 @@ def check_streams(
         Seconds to add to the child's stamps, and factor of its lengths, before the check.
     max_gap_s : float
         Longest time between two poses that interpolation may bridge, in seconds.
-    Function that correlates the angular rates of the original streams. It is called only if needed.
+    correlate : callable, optional
         Correlate the angular rates of the original streams. Called only if needed.
     earlier : ExtrinsicEstimate, optional
         Extrinsic from an earlier solve of these streams.
-    Whether the user declared both streams as exact. Exact streams need not drift apart.
-        Whether the user called both streams exact. Exact streams need not drift apart.
+    are_exact : bool
+        Whether the user declared both streams as exact. Exact streams need not drift apart.
     """
     original = StreamPair(parent, child.scaled(scale), max_gap_s)
     findings = check_stream(original.parent, "parent", max_gap_s)
