@@ -310,7 +310,7 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     lines = rows(TRAJECTORY.stamps_ns)
     path = file([XYZW, *(lines[index] for index in order)])
     message = (
-        r"line 12: timestamps must increase, .*; 4 such lines; sort .* `repair`"
+        r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair=True"
     )
     with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")

@@ -256,12 +256,21 @@ def _is_from_motion(extrinsic: Calibration | Extrinsic) -> bool:
     return isinstance(extrinsic, Calibration) or extrinsic.is_calibration
 
 
-def scatters_in_words(results: Sequence[Calibration]) -> str:
+def scatters_in_words(
+    results: Sequence[Calibration],
+    installed: Calibration | Extrinsic | None = None,
+) -> str:
     """Explain the scatter between recordings in the standard deviations of a comparison."""
     texts = [scatter_in_words(_covariances(result)[0]) for result in results]
+    scatters = "; and ".join(dict.fromkeys(texts))
+    if installed is not None and not _is_from_motion(installed):
+        return (
+            "+/- contains the allowance of the result, or the usual scatter between recordings "
+            f"where that is larger; it is assumed to be {scatters}"
+        )
     return (
         "+/- contains the usual scatter between recordings, which is assumed to be "
-        + "; and ".join(dict.fromkeys(texts))
+        + scatters
     )
 
 

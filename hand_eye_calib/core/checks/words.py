@@ -253,7 +253,7 @@ WORDS = {
     "scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g} to agree with the "
         "parent's",
-        "have the scale estimated, or find out which of the two measures wrongly",
+        "multiply the lengths, or find out which of the two measures wrongly",
     ),
     "one_axis": FindingWords(
         "{axes} cannot be determined from this motion, and will be unknown",

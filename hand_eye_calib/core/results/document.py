@@ -378,24 +378,24 @@ def angles_in_words(transform: Notation, result: Result) -> str:
     applied one after the other about fixed axes, so their standard deviations may differ from those
     about the axes of the target. Unknown axes are ignored.
     """
-    sigmas_rad = result.sigmas[3:]
     sigmas_deg = np.asarray(transform.sigma_rpy_deg)
     # Near a pitch of 90 deg, angles may be unknown although the rotation is known.
-    are_known = np.isfinite(sigmas_rad)
+    are_known = np.isfinite(result.sigmas[3:])
     if not are_known.all():
         are_known &= np.isfinite(sigmas_deg)
     if not are_known.any():
         return ""
-    rotation_rad = float(sigmas_rad[are_known].max())
+    about_deg = np.asarray(transform.sigma_about_deg)[are_known]
+    rotation_deg = float(about_deg.max())
     # If the digits of the angles and of the rotation are equal, no explanation is needed.
-    excess_deg = float(sigmas_deg[are_known].max()) - math.degrees(rotation_rad)
+    excess_deg = float(sigmas_deg[are_known].max()) - rotation_deg
     if not round(excess_deg, 1) > 0.0:
         return _about_axes_in_words(transform, are_known, result)
     if not np.isfinite(transform.rpy_deg).all():
         return ""
     return (
         f"roll and yaw vary together at pitch {transform.rpy_deg[1]:.0f} deg; the rotation itself "
-        f"is good to {amount('roll', rotation_rad)}"
+        f"is good to {amount('roll', math.radians(rotation_deg))}"
     )
 
 

@@ -247,7 +247,7 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
     share = result.n_inliers / max(result.n_pairs, 1)
     if share < _fewest_inliers(result):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
-        advice = "find out why the odometry jumps, and record again"
+        advice = "look in the report for jumps of an odometry, or poses that are too far apart"
         if result.reference == "windows":
             # The outliers of a vehicle are slips.
             text = f"the wheels or the vehicle slip {1 - share:.0%} of the time"

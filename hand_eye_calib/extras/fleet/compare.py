@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
             installed = open_installed(arguments.installed)(*frames)
     comparison = compare(results, installed, distinct_names(arguments.results))
     lines = [*_lines(comparison, results[0], arguments.installed)]
-    lines += wrapped(scatters_in_words(results), "", "  ")
+    lines += wrapped(scatters_in_words(results, installed), "", "  ")
     lines += wrapped(_SEEN_FROM, "", "  ")
     print_result(lines, comparison if arguments.json else None)
     if not arguments.installed:

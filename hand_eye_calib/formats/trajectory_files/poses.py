@@ -474,9 +474,7 @@ def _of_angles(
     if expected == _COMPASS or used != expected:
         reason = ""
         if convention:
-            reason = (
-                ", because that fits the other file with the same columns, too"
-            )
+            reason = ", as in the other file with the same columns"
         elif used != expected:
             reason = ", because the motion fits that and not the usual"
         axes = "x forward, y left, z up"

@@ -216,7 +216,8 @@ def in_order(
                 f"timestamps must increase, found {seconds(stamps_ns[index])} "
                 f"after {seconds(stamps_ns[index - 1])}; "
                 f"{int(is_wrong.sum())} such lines; sort the lines and drop "
-                "repeated timestamps, or set `repair`"
+                "repeated timestamps, or read the file with "
+                "`hec.read_trajectory(path, repair=True)`"
             ),
         )
     indices = np.unique(stamps_ns, return_index=True)[1]
