@@ -1,5 +1,6 @@
 """Write ``report.html``: one self-contained page with the extrinsic, its sigma and the evidence."""
 
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -58,6 +59,7 @@ TONES = {
 # Word and explanation of each verdict on an axis.
 _WORDS = {
     "observed": ("observed", "determined by the motion"),
+    "above": ("above the target", "determined, but less well than the target"),
     "weak": ("weak", "determined, but not well"),
     "unobservable": ("unknown", "do not use this value"),
     "prior": ("prior", "mostly from a prior or the ground"),
@@ -364,7 +366,7 @@ class AxisRow(NamedTuple):
     bar : float
         Length of the bar of the standard deviation (per cent).
     measured : float
-        Length of the bar without the allowance (per cent).
+        Length of the dark part of the bar (per cent): the measured share of the variance.
     """
 
     name: str
@@ -386,15 +388,22 @@ def _axes(calibration: Calibration) -> Iterable[AxisRow]:
     ):
         if dof.name not in calibration.out_of_reach:
             target = target_of(dof.name, calibration)
+            verdict = dof.verdict.value
+            if verdict == "observed" and dof.sigma > target:
+                verdict = "above"
+            bar = _bar(dof.sigma / target)
+            measured_share = 1.0
+            if 0.0 < dof.sigma < math.inf:
+                measured_share = min((measured / dof.sigma) ** 2, 1.0)
             yield AxisRow(
                 dof.name,
                 _AXIS_NAMES[dof.name],
                 text.amount(dof.name, dof.sigma),
-                dof.verdict.value,
-                _WORDS[dof.verdict.value][0],
-                _WORDS["unobservable" if is_bad else dof.verdict.value][1],
-                _bar(dof.sigma / target),
-                _bar(measured / target),
+                verdict,
+                _WORDS[verdict][0],
+                _WORDS["unobservable" if is_bad else verdict][1],
+                bar,
+                bar * measured_share,
             )
 
 
