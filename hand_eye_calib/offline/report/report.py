@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
+import markupsafe
 import numpy as np
 
 from hand_eye_calib.core.assessment.excitation import what_is_missing
@@ -80,6 +81,8 @@ _TOP_FIGURES = ("views", "track", "trajectories")
 
 # Space before an option in a command. The page may break lines only there.
 _OPTION_BEGINS = re.compile(r" (?=--)")
+# Option in a sentence. The page does not break its line at a hyphen.
+_OPTION = re.compile(r"--[a-z][\w-]*")
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEMPLATES = jinja2.Environment(
@@ -89,10 +92,20 @@ _TEMPLATES = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+
+
+def _with_whole_options(sentence: str) -> markupsafe.Markup:
+    """Return a sentence as HTML whose options are not broken over two lines."""
+    escaped = str(markupsafe.escape(sentence))
+    whole = _OPTION.sub(r'<span class="nowrap">\g<0></span>', escaped)
+    return markupsafe.Markup(whole)
+
+
 _TEMPLATES.filters |= {
     "number": text.fixed,
     "printable": printable,
     "spelled": spelled,
+    "whole_options": _with_whole_options,
 }
 _TEMPLATES.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
 _TEMPLATES.globals |= dict(

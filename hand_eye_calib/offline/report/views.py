@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.text import Annotation
 
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError, require_type
@@ -36,6 +37,8 @@ from hand_eye_calib.offline.report.style import (
 
 # Longest name of a sensor that fits into a view, in characters.
 _MAX_NAME = 14
+# Share of a panel's width from its left edge. The name of a sensor beyond it stands on the left.
+_NAME_ON_THE_LEFT = 0.6
 
 # The three views, with their titles. The key has the parent's axes to the right and upwards. The
 # title has the axis along which the reader looks.
@@ -159,6 +162,21 @@ def draw_views(
         panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
         panel.margins(0.3)
+        _keep_names_inside(panel)
+
+
+def _keep_names_inside(panel: Axes) -> None:
+    """Put the names of sensors near the right edge of a panel to the left of their sensors."""
+    panel.apply_aspect()
+    left, right = panel.get_xlim()
+    for name in panel.texts:
+        if not isinstance(name, Annotation):
+            continue
+        share = (name.xy[0] - left) / (right - left)
+        if share > _NAME_ON_THE_LEFT:
+            offset, below = name.get_position()
+            name.set_horizontalalignment("right")
+            name.set_position((-offset, below))
 
 
 def _short_name(frame: str, role: str) -> str:
