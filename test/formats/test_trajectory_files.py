@@ -309,9 +309,7 @@ def test_stamps_out_of_order_are_refused_or_repaired_with_a_warning(file):
     order = [*range(10), 9, 12, 11, 10, *range(13, 30), 3]
     lines = rows(TRAJECTORY.stamps_ns)
     path = file([XYZW, *(lines[index] for index in order)])
-    message = (
-        r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair=True"
-    )
+    message = r"line 12: timestamps must increase, .*; 4 such lines; sort .* repair=True"
     with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
     message = "decrease at 3 of 32 poses; the poses were sorted; dropped 2 with a repeated stamp"
