@@ -1,5 +1,6 @@
 """Write ``report.html``: one self-contained page with the extrinsic, its sigma and the evidence."""
 
+import html
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -10,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
-import markupsafe
 import numpy as np
 
 from hand_eye_calib.core.assessment.excitation import what_is_missing
@@ -94,11 +94,11 @@ _TEMPLATES = jinja2.Environment(
 )
 
 
-def _with_whole_options(sentence: str) -> markupsafe.Markup:
-    """Return a sentence as HTML whose options are not broken over two lines."""
-    escaped = str(markupsafe.escape(sentence))
-    whole = _OPTION.sub(r'<span class="nowrap">\g<0></span>', escaped)
-    return markupsafe.Markup(whole)
+def _with_whole_options(sentence: str) -> str:
+    """Return a sentence as safe HTML whose options are not broken over two lines."""
+    return _OPTION.sub(
+        r'<span class="nowrap">\g<0></span>', html.escape(sentence)
+    )
 
 
 _TEMPLATES.filters |= {
