@@ -37,8 +37,6 @@ from hand_eye_calib.offline.report.style import (
 
 # Longest name of a sensor that fits into a view, in characters.
 _MAX_NAME = 14
-# Share of a panel's width from its left edge. The name of a sensor beyond it stands on the left.
-_NAME_ON_THE_LEFT = 0.6
 
 # The three views, with their titles. The key has the parent's axes to the right and upwards. The
 # title has the axis along which the reader looks.
@@ -166,14 +164,11 @@ def draw_views(
 
 
 def _keep_names_inside(panel: Axes) -> None:
-    """Put the names of sensors near the right edge of a panel to the left of their sensors."""
+    """Put the names of sensors in the right half of a panel to the left of their sensors."""
     panel.apply_aspect()
-    left, right = panel.get_xlim()
+    middle = np.mean(panel.get_xlim())
     for name in panel.texts:
-        if not isinstance(name, Annotation):
-            continue
-        share = (name.xy[0] - left) / (right - left)
-        if share > _NAME_ON_THE_LEFT:
+        if isinstance(name, Annotation) and name.xy[0] > middle:
             offset, below = name.get_position()
             name.set_horizontalalignment("right")
             name.set_position((-offset, below))
