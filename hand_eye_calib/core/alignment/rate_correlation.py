@@ -225,9 +225,8 @@ def _best_correlation(
     rivals = significance[np.abs(lags_s - lags_s[best]) > peak_width_s]
     # Vertex of the parabola through the best lag and its two neighbours, in steps from the best
     # lag.
-    below, top, above = coefficients[
-        np.arange(best - 1, best + 2) % len(coefficients)
-    ]
+    around = np.arange(best - 1, best + 2) % len(coefficients)
+    below, top, above = coefficients[around]
     curvature = below - 2 * top + above
     vertex = 0.0
     if curvature < 0:
@@ -259,9 +258,8 @@ def angular_rates(
     """
     stamps_ns = trajectory.stamps_ns
     n_windows = max(int((trajectory.duration_s - window_s) / step_s), 0)
-    starts_ns = stamps_ns[0] + np.round(
-        np.arange(n_windows) * step_s * 1e9
-    ).astype(np.int64)
+    elapsed_ns = np.round(np.arange(n_windows) * step_s * 1e9)
+    starts_ns = stamps_ns[0] + elapsed_ns.astype(np.int64)
     ends_ns = starts_ns + round(window_s * 1e9)
     before, after = np.split(
         trajectory.at(np.concatenate([starts_ns, ends_ns])), 2

@@ -156,9 +156,8 @@ def log_ratio(
 def _solve(H: FloatArray, S: FloatArray) -> FloatArray:
     """Return ``H^-1 S`` (..., n) of matrices (..., n, n) and vectors (..., n)."""
     # If S has fewer dimensions than H, NumPy 1 reads S as a stack of vectors instead of columns.
-    columns = np.broadcast_to(S, np.broadcast_shapes(S.shape, H.shape[:-1]))[
-        ..., None
-    ]
+    shape = np.broadcast_shapes(S.shape, H.shape[:-1])
+    columns = np.broadcast_to(S, shape)[..., None]
     try:
         solved = np.linalg.solve(H, columns)
     except np.linalg.LinAlgError:

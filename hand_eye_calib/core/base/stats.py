@@ -179,9 +179,9 @@ def robust_regression(
         roots = np.sqrt(weights)[:, None]
         scaled_rows = (roots[..., None] * rows).reshape(-1, rows.shape[2])
         scaled_targets = (roots * targets).ravel()
-        values = np.linalg.lstsq(
+        values, *_ = np.linalg.lstsq(
             scaled_rows, scaled_targets, rcond=_RANK_TOLERANCE
-        )[0]
+        )
         lengths = np.linalg.norm(rows @ values - targets, axis=1)
         divisor = max(unit(lengths), _SMALLEST_UNIT)
         weights = robust_weights(kind, (lengths / divisor) ** 2)

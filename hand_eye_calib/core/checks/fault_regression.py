@@ -361,15 +361,13 @@ def delay_regression(
     is_regular = np.zeros(len(stamps_ns), dtype=bool)
     inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
     multiples = np.array([-2, -1, 1, 2])
-    elapsed_s = (
-        stamps_ns[inner[:, None] + step * multiples] - stamps_ns[inner, None]
-    ) * 1e-9
+    around_ns = stamps_ns[inner[:, None] + step * multiples]
+    elapsed_s = (around_ns - stamps_ns[inner, None]) * 1e-9
     errors_s = np.abs(elapsed_s - step_s * multiples)
     is_regular[inner] = (errors_s < _MAX_STAMP_ERROR * step_s).all(axis=1)
     middles = (motions.i + motions.j) // 2
-    motions = motions[
-        is_regular[motions.i] & is_regular[motions.j] & is_regular[middles]
-    ]
+    has_regular_ends = is_regular[motions.i] & is_regular[motions.j]
+    motions = motions[has_regular_ends & is_regular[middles]]
     if len(motions) < BLOCKS**2:
         return None
     X = T_parent_child

@@ -126,9 +126,9 @@ def graded(
     """
     limits = LIMITS[key]
     size = abs(size)
-    if not size >= max(
-        limits.note, limits.sigmas * sigma
-    ):  # NaN is below all limits
+    # NaN is below all limits.
+    is_noted = size >= max(limits.note, limits.sigmas * sigma)
+    if not is_noted:
         return None
     if size > limits.error:
         severity = Severity.ERROR

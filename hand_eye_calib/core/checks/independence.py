@@ -243,9 +243,9 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     )
     difference = of_source - of_computed
     arms = se3.skew(of_computed[:, 1])
-    lever_arm = np.linalg.lstsq(
+    lever_arm, *_ = np.linalg.lstsq(
         arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
-    )[0]
+    )
     difference[:, 0] -= arms @ lever_arm
     is_calm = _is_calm(of_computed, of_source)
     quarters = _upper_quarters(
@@ -312,14 +312,10 @@ def check_drift(pose_pairs: PosePairs, X: FloatArray) -> list[Finding]:
         The extrinsic.
     """
     path = coarse(Trajectory(pose_pairs.stamps_ns, pose_pairs.Ts_pw_p), _STEP_S)
-    path_m = float(
-        np.linalg.norm(
-            np.diff(se3.translation_of(path.poses), axis=0), axis=1
-        ).sum()
-    )
-    aligned = _AlignedPositions.of(
-        pose_pairs[:: 1 + len(pose_pairs) // _MOST_POSES], X
-    )
+    steps = np.diff(se3.translation_of(path.poses), axis=0)
+    path_m = float(np.linalg.norm(steps, axis=1).sum())
+    stride = 1 + len(pose_pairs) // _MOST_POSES
+    aligned = _AlignedPositions.of(pose_pairs[::stride], X)
     apart_m = median(aligned.distances_m)
     is_close = path_m >= _LONG_PATH_M and apart_m <= _LEAST_DRIFT * path_m
     is_steady = path_m >= _STEADY_PATH_M and _is_steady(aligned)
@@ -434,9 +430,8 @@ def _apart_in_windows(
     # Align all windows with the same number of points at once.
     for count in np.unique(counts[counts >= MIN_PAIRS]):
         rows = firsts[counts == count, None] + np.arange(count)
-        distances_m += medians(
-            _alignment(points[rows], others[rows])[1]
-        ).tolist()
+        _, distances = _alignment(points[rows], others[rows])
+        distances_m += medians(distances).tolist()
     return median(distances_m) if distances_m else 0.0
 
 

@@ -200,9 +200,8 @@ def _find_propagation(
     trajectory: Trajectory, velocities: Sequence[StepVelocities], stream: str
 ) -> Finding | None:
     """Return the finding about predicted poses that jump at regular corrections, or None."""
-    stamps_s: FloatArray = (
-        trajectory.stamps_ns[1:] - trajectory.stamps_ns[0]
-    ) * 1e-9
+    elapsed_ns = trajectory.stamps_ns[1:] - trajectory.stamps_ns[0]
+    stamps_s: FloatArray = elapsed_ns * 1e-9
     steps_s = np.diff(trajectory.stamps_ns) * 1e-9
     for _, excess in velocities:
         for factor in _CORRECTIONS:

@@ -225,9 +225,8 @@ def _scatter_of_halves(
         first.T_parent_child, first.sigmas, second
     )
     half_sigmas = np.maximum([first.sigmas, second.sigmas], _ROUNDING)
-    are_alike = half_sigmas.max(
-        axis=0
-    ) < _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
+    limits = _MAX_RATIO_OF_HALVES * half_sigmas.min(axis=0)
+    are_alike = half_sigmas.max(axis=0) < limits
     between = np.where(are_alike, between, np.nan)
     # The result is about the mean of both halves. So its standard deviation is half of that of
     # their difference. The covariances of the halves lack the allowance. The sigma of a noise model

@@ -313,9 +313,8 @@ class Snapshot:
             if len(stream) == 0:
                 return f"{needed}: no poses on the {name} stream"
         start_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
-        common_s = (
-            min(parent.stamps_ns[-1], child.stamps_ns[-1]) - start_ns
-        ) * 1e-9
+        end_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1])
+        common_s = (end_ns - start_ns) * 1e-9
         counts = f"{len(parent)} parent and {len(child)} child poses"
         if common_s < 0:
             offset_s = float(self.config.time_offset)

@@ -317,9 +317,8 @@ class NormalEquations:
         self.is_complete = self._is_observed.all(axis=-1)
         self.step = -(self.covariance @ gradient[..., None])[..., 0]
         self.cost = products[..., -1, -1] + (gradient * self.step).sum(axis=-1)
-        self.log_determinant = np.log(values).sum(axis=-1) - 2.0 * np.log(
-            scale
-        ).sum(axis=-1)
+        log_scales = 2.0 * np.log(scale).sum(axis=-1)
+        self.log_determinant = np.log(values).sum(axis=-1) - log_scales
         self.log_determinant += self._log_unseen_scale()
 
     def _log_unseen_scale(self) -> FloatArray:

@@ -391,9 +391,8 @@ class Posterior:
             below[:, WHITE:] = -(transposed(h1_processes) @ W_H0)
         diagonal[:-1] += transposed(h0) @ W_H0
         np.negative(W_H0, out=W_H0)
-        diagonal[later, :WHITE, :WHITE] += self._white_precisions[
-            start + 1 : end + 1
-        ]
+        precisions = self._white_precisions[start + 1 : end + 1]
+        diagonal[later, :WHITE, :WHITE] += precisions
         if start == 0:
             diagonal[0, :WHITE, :WHITE] += self._white_precisions[0]
         for group in self.groups:
@@ -445,9 +444,8 @@ class Posterior:
         covariances, below = self.factor.selected_inverse
         h0 = space.h0
         half = space.apply_h1(covariances[1:])
-        total = space.apply_h1(transposed(half)) + h0 @ covariances[
-            :-1
-        ] @ transposed(h0)
+        at_start = h0 @ covariances[:-1] @ transposed(h0)
+        total = space.apply_h1(transposed(half)) + at_start
         mixed = space.apply_h1(below) @ transposed(h0)
         total -= mixed
         total -= transposed(mixed)

@@ -107,9 +107,8 @@ class Calibration(Judged):
         sigmas = self.sigmas_printed
         # Near gimbal lock, a known angle has no standard deviation.
         is_known = np.isfinite(self.sigmas)
-        values = np.where(
-            is_known, se3.xyz_rpy(self.T_parent_child), np.nan
-        ).tolist()
+        pose = se3.xyz_rpy(self.T_parent_child)
+        values = np.where(is_known, pose, np.nan).tolist()
         rows = zip(self.observability, values, sigmas, strict=True)
         table = []
         for dof, value, sigma in rows:

@@ -336,10 +336,9 @@ def printed_numbers(
             elif not np.isfinite(sigma):  # near gimbal lock
                 texts[axis] = f"{fixed(value, 2)} {unit}"
             else:
-                number = with_sigma(
-                    value, sigma, 3 if unit == "m" else 2
-                ).replace("+/-", sign)
-                texts[axis] = f"{number} {unit}"
+                decimals = 3 if unit == "m" else 2
+                number = with_sigma(value, sigma, decimals)
+                texts[axis] = f"{number.replace('+/-', sign)} {unit}"
     return texts
 
 

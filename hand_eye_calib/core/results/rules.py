@@ -190,9 +190,8 @@ def _scatter_of(
     if scatter is None:
         return 0.0, False
     of_target = scatter / axis.target
-    is_far = (
-        excess or 0.0
-    ) > CONTRADICTED_SIGMAS and of_target > CONTRADICTED_SHARE
+    is_significant = (excess or 0.0) > CONTRADICTED_SIGMAS
+    is_far = is_significant and of_target > CONTRADICTED_SHARE
     if (over_own or 0.0) > CONTRADICTED_SIGMAS:
         is_far |= of_target > CONTRADICTED_TARGETS
     return scatter, is_far

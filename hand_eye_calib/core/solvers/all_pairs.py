@@ -66,9 +66,9 @@ def solve_park(pairs: MotionPairs) -> Solution:
     """
     R = align_rotation_vectors(pairs)
     rows, targets = translation_equations(pairs, R)
-    t = np.linalg.lstsq(
+    t, *_ = np.linalg.lstsq(
         rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE
-    )[0]
+    )
     T_parent_child = se3.from_rotation_translation(R, t)
     objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))

@@ -100,9 +100,8 @@ def _maximise_smallest_eigenvalue(M: FloatArray, enough: float) -> float:
         )
         step, decrement = _newton_step(solved, weight)
         unknowns = unknowns + step
-        lowest = np.linalg.eigvalsh(
-            Z + np.tensordot(unknowns[:-1], tables.free, 1)
-        )[0]
+        matrix = Z + np.tensordot(unknowns[:-1], tables.free, 1)
+        lowest = np.linalg.eigvalsh(matrix)[0]
         best = max(best, float(lowest))
         if decrement < 0.5:
             if len(Z_across) / weight < _CLOSE:

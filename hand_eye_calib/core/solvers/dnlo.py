@@ -96,13 +96,11 @@ def solve(
     """
     searched = pairs
     if len(pairs) > _MAX_SEARCHED:
-        searched = pairs[
-            np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)
-        ]
+        rows = np.linspace(0, len(pairs) - 1, _MAX_SEARCHED).astype(int)
+        searched = pairs[rows]
     floor = min_inlier_fraction * len(searched)
-    T = _Search(quadratic_form.condense(searched), threshold, floor).best(
-        searched
-    )
+    search = _Search(quadratic_form.condense(searched), threshold, floor)
+    T = search.best(searched)
     return _refined(pairs, T, threshold, min_inlier_fraction * len(pairs))
 
 
@@ -215,9 +213,8 @@ def truncate(
                 * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
             )
     n_outliers = costs.shape[-1] - weights.sum(axis=-1)
-    return weights, np.einsum(
-        "...k,...k", weights, costs
-    ) + threshold * n_outliers
+    of_inliers = np.einsum("...k,...k", weights, costs)
+    return weights, of_inliers + threshold * n_outliers
 
 
 @dataclass(frozen=True)

@@ -166,9 +166,8 @@ def weighted_sum(coefficients: FloatArray, weights: FloatArray) -> FloatArray:
     moments = np.zeros((24, 24))
     for start in range(0, len(coefficients), _SUMMED_BLOCK):
         block = slice(start, start + _SUMMED_BLOCK)
-        moments += (
-            coefficients[block] * weights[block, None]
-        ).T @ coefficients[block]
+        weighted = coefficients[block] * weights[block, None]
+        moments += weighted.T @ coefficients[block]
     by_residual = (moments @ _RESIDUAL.reshape(24, -1)).reshape(-1, DIMENSION)
     return _RESIDUAL.reshape(-1, DIMENSION).T @ by_residual
 

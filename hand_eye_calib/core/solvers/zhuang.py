@@ -83,9 +83,9 @@ def _gauss_newton(
     """
     for _ in range(_MAX_ITERATIONS):
         products, derivatives = _products(parameters)
-        step = np.linalg.lstsq(
+        step, *_ = np.linalg.lstsq(
             M @ derivatives, -M @ products, rcond=all_pairs.RANK_TOLERANCE
-        )[0]
+        )
         parameters = parameters + step
         settled = bool((np.abs(step) < _STEP_TOLERANCE).all())
         if settled:

@@ -320,9 +320,8 @@ def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:
     threshold = 2.0 * (moved.SIGNIFICANT - moved.log_ratio(evidence))
     # Columns are the scores of unit shifts along the parent's axes.
     scores = H @ np.kron(np.eye(2), R.T)
-    squares = (
-        scores * np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)
-    ).sum(axis=0)
+    sizes_by_score = np.linalg.solve(H + moved.SHIFT_INFORMATION, scores)
+    squares = (scores * sizes_by_score).sum(axis=0)
     # Without motion, a shift along an axis does not change the score, so its size is unlimited.
     sizes = np.full(6, np.inf)
     np.divide(threshold, squares, out=sizes, where=squares > 0.0)

@@ -268,9 +268,9 @@ class MountMonitor:
             if not 0 < gap_ns <= TUNING.max_motion_s * _SECOND_NS:
                 self._tail = PosePairs.empty()
         poses = PosePairs.concatenate(self._tail, pose_pairs)
-        poses = poses[
-            np.unique(poses.stamps_ns // TUNING.step_ns, return_index=True)[1]
-        ]
+        steps = poses.stamps_ns // TUNING.step_ns
+        _, first_of_step = np.unique(steps, return_index=True)
+        poses = poses[first_of_step]
         stamps_ns = poses.stamps_ns
         seconds = poses.stamps_ns // _SECOND_NS
         # A motion lasts from pose i to the first pose j that is at least one second later.
@@ -283,9 +283,8 @@ class MountMonitor:
         i = np.flatnonzero(
             has_end & (seconds < incomplete_s) & (seconds > self._last_s)
         )
-        i = i[
-            stamps_ns[j[i]] - stamps_ns[i] <= TUNING.max_motion_s * _SECOND_NS
-        ]
+        durations_ns = stamps_ns[j[i]] - stamps_ns[i]
+        i = i[durations_ns <= TUNING.max_motion_s * _SECOND_NS]
         self._last_s = max(self._last_s, incomplete_s - 1)
         pairs = pairs_between(poses.Ts_pw_p, poses.Ts_cw_c, i, j[i])
         second_of_pair = seconds[i]
@@ -340,9 +339,8 @@ class MountMonitor:
         floor = floor_of_pairs(
             pairs, np.ones(len(pairs)), self._installed, speed_m_s
         )
-        floor += moved.shift_covariance(
-            1e-3, 1e-4
-        )  # keeps the covariance regular
+        # Keep the covariance regular.
+        floor += moved.shift_covariance(1e-3, 1e-4)
         self._covariance = self._covariance + floor
         self._wander = TUNING.wander**2 * floor
         for item in seconds:
@@ -372,9 +370,8 @@ class MountMonitor:
         )
         # The oldest second leaves the memory. After an alarm, the old evidence must stay unchanged.
         if n_seconds == TUNING.memory_s and self.alarm is None:
-            self._old = (
-                1.0 - 1.0 / TUNING.old_memory_s
-            ) * self._old + self._seconds.sums[0]
+            kept_share = 1.0 - 1.0 / TUNING.old_memory_s
+            self._old = kept_share * self._old + self._seconds.sums[0]
         stamps_ns = np.append(self._stamps_ns, np.int64(second.stamp_ns))
         self._stamps_ns = stamps_ns[-TUNING.memory_s :]
         tables = np.concatenate([self._seconds.sums, table[None]])
@@ -383,9 +380,8 @@ class MountMonitor:
         self._noise = (1.0 - share) * self._noise + share * scatter
         # Mean over the last 100 seconds.
         n_averaged = min(n_seconds + 1, 100)
-        self._motions_per_s += (
-            len(second.residuals) - self._motions_per_s
-        ) / n_averaged
+        excess = len(second.residuals) - self._motions_per_s
+        self._motions_per_s += excess / n_averaged
 
     # ---- test
 

@@ -92,9 +92,8 @@ class Split(NamedTuple):
         """Return the values (N, ...) of all samples, divided into windows (W, K, ...)."""
         n_windows = len(self.is_enough)
         whole = values[: n_windows * self.size]
-        return whole.reshape(n_windows, self.size, *values.shape[1:])[
-            self.is_enough
-        ]
+        windows = whole.reshape(n_windows, self.size, *values.shape[1:])
+        return windows[self.is_enough]
 
 
 def split(

@@ -198,9 +198,8 @@ def check_position(
         return []
     lengths_m = np.abs(lever_arm[axes])
     sigmas_m = sigmas[axes]
-    if (
-        lengths_m > np.maximum(_ZERO_M, agreement.ZERO_SIGMAS * sigmas_m)
-    ).any():
+    limits_m = np.maximum(_ZERO_M, agreement.ZERO_SIGMAS * sigmas_m)
+    if (lengths_m > limits_m).any():
         return []
     uppers_m = np.sort(lengths_m + 2.0 * sigmas_m)
     if uppers_m[1] > _UNCERTAIN_M:

@@ -246,10 +246,8 @@ def check_rotation(
     if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
         return []
     angles_rad = np.abs(se3.rotation_log(rotation))
-    if (
-        angles_rad
-        > np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)
-    ).any():
+    limits_rad = np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)
+    if (angles_rad > limits_rad).any():
         return []
     angle_rad = float(np.linalg.norm(angles_rad))
     severity = Severity.ERROR if has_rates else Severity.WARNING

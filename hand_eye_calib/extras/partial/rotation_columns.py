@@ -159,9 +159,8 @@ class RotationFit(Fit):
         weak: list[int] = []
         prior_sigmas: list[float] = []
         for name in ("gains", "shears"):
-            is_weak = np.abs(
-                self.estimate(name).values
-            ) <= BIASES * self.biases(name)
+            sizes = np.abs(self.estimate(name).values)
+            is_weak = sizes <= BIASES * self.biases(name)
             places = np.array(self.places[name])[is_weak]
             weak += places.tolist()
             prior_sigmas += [_COLUMNS[name].sigma] * len(places)

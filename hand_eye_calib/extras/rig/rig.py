@@ -484,9 +484,8 @@ class RigCalibration:
 
     def T(self, first: str, second: str) -> FloatArray:
         """Return the pose (4, 4) of the sensor ``second`` in the frame of the sensor ``first``."""
-        X_first, X_second = self.Xs[
-            [self.sensors.index(first), self.sensors.index(second)]
-        ]
+        places = [self.sensors.index(first), self.sensors.index(second)]
+        X_first, X_second = self.Xs[places]
         return se3.inverse(X_first) @ X_second
 
     def covariance(self, first: str, second: str) -> FloatArray:

@@ -375,9 +375,8 @@ class ScanReading(Reading):
             Pose of the middle of the scan in the map.
         """
         means = np.array(self._fine_map.voxel_points())[:, :3]
-        covariances = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))[
-            :, :3, :3
-        ]
+        matrices = np.reshape(self._fine_map.voxel_covs(), (-1, 4, 4))
+        covariances = matrices[:, :3, :3]
         to_map = se3.rotation_of(pose).T
         points = still @ to_map + se3.translation_of(pose)
         rays = scan.points @ to_map

@@ -247,9 +247,8 @@ def grey_of(message: Any) -> Any:
             f"images are encoded as {message.encoding[:40]!r}; expected {expected}"
         )
     n_channels = message.step // message.width
-    rows = data.reshape(message.height, message.step)[
-        :, : message.width * n_channels
-    ]
+    padded_rows = data.reshape(message.height, message.step)
+    rows = padded_rows[:, : message.width * n_channels]
     image = rows.reshape(message.height, message.width, n_channels)
     if not conversion:
         return image[:, :, 0]
@@ -372,9 +371,8 @@ class TargetFinder:
         corners = self._corners[indices[is_on_target]].reshape(-1, 3)
         if len(corners) < self._target.fewest_corners:
             return False
-        pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)[
-            is_on_target
-        ]
+        pixels = np.asarray(pixels, dtype=float).reshape(len(ids), -1, 2)
+        pixels = pixels[is_on_target]
         pose = self._pose(corners, pixels.reshape(-1, 1, 2))
         is_good = pose.rms_px <= _LARGEST_RMS_PX
         if is_good:

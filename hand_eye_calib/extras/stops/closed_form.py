@@ -88,9 +88,9 @@ def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
     columns = np.concatenate([R_A, minus_one], axis=2)
     t_A = se3.translation_of(stops.Ts_world_parent)
     values = se3.translation_of(stops.Ts_world_child) @ R_Z.T - t_A
-    translations = np.linalg.lstsq(
+    translations, *_ = np.linalg.lstsq(
         columns.reshape(-1, 6), values.ravel(), rcond=1e-9
-    )[0]
+    )
     X = se3.from_rotation_translation(R_X, translations[:3])
     Z = se3.from_rotation_translation(R_Z, translations[3:])
     return X, Z
@@ -129,10 +129,8 @@ def _costs(errors: FloatArray) -> FloatArray:
     tiny = np.finfo(float).tiny
     n = errors.shape[1]
     rank = min(max(_STOPS_PER_START, int(_COMPARED_QUANTILE * n)), n - 1)
-    distances_m = np.sort(
-        np.linalg.norm(se3.translation_of(errors), axis=-1), axis=1
-    )[:, rank]
-    angles_rad = np.sort(se3.rotation_angle(se3.rotation_of(errors)), axis=1)[
-        :, rank
-    ]
+    lengths_m = np.linalg.norm(se3.translation_of(errors), axis=-1)
+    distances_m = np.sort(lengths_m, axis=1)[:, rank]
+    angles_rad = se3.rotation_angle(se3.rotation_of(errors))
+    angles_rad = np.sort(angles_rad, axis=1)[:, rank]
     return np.asarray(np.log(distances_m + tiny) + np.log(angles_rad + tiny))

@@ -99,10 +99,10 @@ def check_rows(poses: StopPoses) -> Iterator[Finding]:
     best = ""
     smallest_rad = difference_rad / MIN_IMPROVEMENT
     for order in _usual_orders(len(of_parent)):
-        reordered_parent = of_parent[
-            np.ix_(order.parent_rows, order.parent_rows)
-        ]
-        reordered_child = of_child[np.ix_(order.child_rows, order.child_rows)]
+        in_parent = np.ix_(order.parent_rows, order.parent_rows)
+        in_child = np.ix_(order.child_rows, order.child_rows)
+        reordered_parent = of_parent[in_parent]
+        reordered_child = of_child[in_child]
         reordered_rad = median_difference(reordered_parent, reordered_child)
         if reordered_rad < smallest_rad:
             best = order.text

@@ -81,9 +81,8 @@ class Drive:
         forward, left, turns = self.model.steps_of(others[2:], *self.steps)
         speeds = forward / np.diff(self.stamps_s)
         steps = np.stack([forward, left - slip * speeds**2 * turns, turns])
-        predicted[:, [0, 1, 5]] = motions(
-            self.stamps_s, steps, self.ends_s + clock_s
-        ).T
+        in_plane = motions(self.stamps_s, steps, self.ends_s + clock_s)
+        predicted[:, [0, 1, 5]] = in_plane.T
         return predicted
 
     def rows(self, T: FloatArray, others: FloatArray) -> FloatArray:

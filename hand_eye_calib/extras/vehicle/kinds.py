@@ -394,9 +394,8 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
     """
     residuals = np.zeros(drive.xi.shape)
     residuals[:, drive.components] = fit.residuals
-    window_start_ns, window_end_ns = start_ns + np.round(
-        drive.ends_s * 1e9
-    ).astype(np.int64)
+    since_start_ns = np.round(drive.ends_s * 1e9).astype(np.int64)
+    window_start_ns, window_end_ns = start_ns + since_start_ns
     return Residuals(
         translation=residuals[:, :3],
         rotation=residuals[:, 3:] @ se3.rotation_of(fit.T_base_sensor),

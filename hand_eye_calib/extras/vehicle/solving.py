@@ -468,9 +468,8 @@ def _weights(
         squared = np.einsum("kc,cd,kd->k", residuals, inverse(noise), residuals)
         if is_weighted:
             weights = (STUDENT + n_components) / (STUDENT + squared)
-        noise = (
-            weights[:, None] * residuals
-        ).T @ residuals / n_windows + minimum
+        weighted = weights[:, None] * residuals
+        noise = weighted.T @ residuals / n_windows + minimum
     if is_weighted:
         weights[squared > CHI2[_TAIL][n_components]] = 0.0
     return weights, noise
@@ -508,9 +507,8 @@ def start_of(drive: Drive) -> tuple[FloatArray, FloatArray]:
     level = np.stack([ahead, np.cross(up, ahead), up])
     x, y, _ = level @ drive.xi[:, :3].T
     columns = np.column_stack([displacements, 1j * turns])
-    factor, rotated_position = np.linalg.lstsq(columns, x + 1j * y, rcond=None)[
-        0
-    ]
+    factors, *_ = np.linalg.lstsq(columns, x + 1j * y, rcond=None)
+    factor, rotated_position = factors
     length_ratio = abs(factor)
     direction = factor / length_ratio  # exp(-i yaw)
     yaw = se3.rotation_exp([0.0, 0.0, -np.angle(direction)])

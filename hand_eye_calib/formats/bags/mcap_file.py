@@ -176,9 +176,8 @@ class McapFile(Storage):
         """
         position = self._stream.seek(0)
         try:
-            for record in StreamReader(
-                self._stream, validate_crcs=True
-            ).records:
+            reader = StreamReader(self._stream, validate_crcs=True)
+            for record in reader.records:
                 yield record
                 position = self._stream.tell()
         except MemoryError:

@@ -381,9 +381,8 @@ class Run(NamedTuple):
         for data in self.messages:
             try:
                 message = decode(data)
-            except (
-                Exception
-            ) as error:  # the libraries raise errors of many kinds
+            # The libraries raise errors of many kinds.
+            except Exception as error:
                 raise self.unreadable(error) from error
             yield message
 

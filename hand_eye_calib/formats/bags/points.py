@@ -63,9 +63,8 @@ def rows_of_points(message: Any) -> Any:
                 "itemsize": size,
             }
         )
-        data = np.asarray(message.data, dtype=np.uint8)[
-            : message.height * row_step
-        ]
+        data = np.asarray(message.data, dtype=np.uint8)
+        data = data[: message.height * row_step]
         rows = data.reshape(message.height, row_step)[:, :width]
         return np.ascontiguousarray(rows).reshape(-1).view(dtype)
     except (ValueError, IndexError, TypeError) as error:

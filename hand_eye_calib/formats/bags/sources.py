@@ -253,9 +253,8 @@ class JoinedReading(Reading):
             )
         orientations = rotations.trajectory()
         first_ns, last_ns = orientations.stamps_ns[[0, -1]]
-        fixes = fixes[
-            (fixes.stamps_ns >= first_ns) & (fixes.stamps_ns <= last_ns)
-        ]
+        is_after_first = fixes.stamps_ns >= first_ns
+        fixes = fixes[is_after_first & (fixes.stamps_ns <= last_ns)]
         quats_xyzw = se3.to_quat_xyzw(orientations.at(fixes.stamps_ns))
         poses = np.c_[fixes.poses[:, :3], quats_xyzw]
         table = PoseTable.of(

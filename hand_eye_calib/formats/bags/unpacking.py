@@ -110,16 +110,14 @@ def _unpack_alike(
     has_same_encoding = is_ros1 or (encodings == encodings[0]).all()
     frames = rows[:, START + STAMP_SIZE : first.end - POSE_SIZE]
     stamps = np.ascontiguousarray(rows[:, START : START + STAMP_SIZE])
-    seconds, nanoseconds = stamps.view("<u4" if is_ros1 else "<i4").T.astype(
-        np.int64
-    )
+    columns = stamps.view("<u4" if is_ros1 else "<i4").T
+    seconds, nanoseconds = columns.astype(np.int64)
     are_stamps = (nanoseconds // NS_PER_S == 0).all()
     has_same_frames = (frames == frames[0]).all()
     if not (has_same_encoding and are_stamps and has_same_frames):
         return None
-    poses = np.ascontiguousarray(
-        rows[:, first.end - POSE_SIZE : first.end]
-    ).view("<f8")
+    pose_bytes = rows[:, first.end - POSE_SIZE : first.end]
+    poses = np.ascontiguousarray(pose_bytes).view("<f8")
     stamps_ns = seconds * NS_PER_S + nanoseconds
     return PoseTable.of(stamps_ns, poses, first.world_frame, first.sensor_frame)
 
@@ -195,9 +193,8 @@ class MessageReader:
         self.n_left_out += int((~is_usable).sum())
         poses = np.tile([0.0] * 6 + [1.0], (len(values), 1))  # placeholders
         if is_usable.any():
-            target = COLUMNS[
-                "positions" if self._measures == "positions" else "rotations"
-            ]
+            has_positions = self._measures == "positions"
+            target = COLUMNS["positions" if has_positions else "rotations"]
             measured = self._measured(
                 columns.stamps_ns[is_usable], values[is_usable]
             )

@@ -81,9 +81,8 @@ def deliver(
     pictures : sequence of callable
         Functions that draw further figures of the report, given the calibration.
     """
-    if (
-        arguments.installed or arguments.base_frame
-    ) and not calibration.status.failure:
+    asks_for_robot = arguments.installed or arguments.base_frame
+    if asks_for_robot and not calibration.status.failure:
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}

@@ -225,9 +225,8 @@ def view_streams(
         gaps = np.flatnonzero(
             are_gaps(np.diff(stream.stamps_ns) * 1e-9, max_gap_s)
         )
-        edges_ns = stream.stamps_ns[
-            np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])
-        ]
+        edges = np.sort(np.r_[0, gaps, gaps + 1, len(stream) - 1])
+        edges_ns = stream.stamps_ns[edges]
         spans_s.append((edges_ns.reshape(-1, 2) - start_ns) * 1e-9)
     quantity = "angular rate" if has_rates else "speed"
     return StreamView(
@@ -386,9 +385,7 @@ def spread_of_position(
         is_huge = (variances > UNKNOWN_M**2) & is_unknown.any()
         if is_huge.any() or not is_unknown.any():
             finite = directions[:, ~is_huge]
-            return (finite * variances[~is_huge]) @ finite.T, directions[
-                :, is_huge
-            ].T
-    return np.diag(np.where(is_unknown, 0.0, sigmas_m) ** 2), np.eye(3)[
-        is_unknown
-    ]
+            unknown_directions = directions[:, is_huge].T
+            return (finite * variances[~is_huge]) @ finite.T, unknown_directions
+    variances_m2 = np.where(is_unknown, 0.0, sigmas_m) ** 2
+    return np.diag(variances_m2), np.eye(3)[is_unknown]

@@ -182,9 +182,8 @@ class SolveCycle:
         targets = {name: getattr(config, name) for name in _TARGETS}
         result = self.published
         has_same_values = replace(before, **targets) == config
-        has_same_names = before.given.difference(
-            _TARGETS
-        ) == config.given.difference(_TARGETS)
+        others_before = before.given.difference(_TARGETS)
+        has_same_names = others_before == config.given.difference(_TARGETS)
         if result is None or not (has_same_values and has_same_names):
             self.goal.follow(config.targets)
             return

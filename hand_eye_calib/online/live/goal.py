@@ -273,9 +273,10 @@ class Goal:
         ratios = np.full(6, np.inf)
         np.divide(sigmas_measured**2, allowed, out=ratios, where=allowed > 0.0)
         ratios[np.isin(AXES, newest.out_of_reach)] = 0.0
-        ratios[
-            [dof.verdict is DofVerdict.PRIOR for dof in newest.observability]
-        ] = 0.0
+        is_by_prior = [
+            dof.verdict is DofVerdict.PRIOR for dof in newest.observability
+        ]
+        ratios[is_by_prior] = 0.0
         return ratios
 
     def _update_best(self, newest: Calibration, ratios: FloatArray) -> None:

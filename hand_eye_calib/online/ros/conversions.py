@@ -95,8 +95,7 @@ def to_pose_with_covariance(
 
 def fill(position: Any, orientation: Any, T_target_source: FloatArray) -> None:
     """Write a transform into the position and the orientation of a message."""
-    position.x, position.y, position.z = se3.translation_of(
-        T_target_source
-    ).tolist()
+    translation = se3.translation_of(T_target_source).tolist()
+    position.x, position.y, position.z = translation
     quat_xyzw = se3.to_quat_xyzw(T_target_source).tolist()
     orientation.x, orientation.y, orientation.z, orientation.w = quat_xyzw

@@ -99,9 +99,8 @@ def _axes(
 def _ellipsoid(calibration: Calibration) -> Marker:
     """Return the ellipsoid of the child's position, in the colour of the verdict."""
     T_parent_child = calibration.T_parent_child
-    covariance = turned(
-        se3.rotation_of(T_parent_child), calibration.covariance
-    )[:3, :3]
+    rotation = se3.rotation_of(T_parent_child)
+    covariance = turned(rotation, calibration.covariance)[:3, :3]
     variances, directions = np.linalg.eigh(covariance)
     # Eigenvectors may be left-handed; a rotation is right-handed.
     directions[:, 2] *= np.linalg.det(directions)
