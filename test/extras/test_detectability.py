@@ -17,6 +17,7 @@ from hand_eye_calib.core.results.records import AXES, DofVerdict
 from hand_eye_calib.extras.detectability import injection
 from hand_eye_calib.extras.detectability.injection import evidence_of
 from hand_eye_calib.extras.detectability.record import (
+    Detectability,
     DetectabilityPart,
     find_undetectable,
 )
@@ -257,3 +258,13 @@ def test_a_prior_is_no_reason_for_care(result):
     assert list(find_undetectable(doubted))
     accepted = with_prior.with_part("detectability", nothing_shows)
     assert not list(find_undetectable(accepted))
+
+
+def test_the_short_sentence_has_the_largest_detectable_errors():
+    lengths = {"x": 0.01, "y": 0.03, "z": np.inf}
+    angles = {"roll": 0.002, "pitch": 0.00873, "yaw": 0.003}
+    value = Detectability(lengths | angles, {}, 0.01, 0.01)
+    assert DetectabilityPart().brief_facts(value, None) == [
+        "Errors above 3 cm along x and y or 0.5 deg would have been noticed"
+    ]
+    assert DetectabilityPart().brief_facts(None, None) == []

@@ -482,3 +482,33 @@ def test_the_end_states_what_the_saved_result_is(parts, tone, start):
     assert view.sentence.startswith(start)
     assert ("confirmed" in view.sentence) == (not parts)
     assert list(faults_of(view, ended)) == []
+
+
+def test_the_angles_are_explained_at_the_end():
+    words = "roll and yaw vary together at pitch 52 deg"
+    extrinsic = replace(EXTRINSIC, result=replace(RESULT, angles=words))
+    view = view_of(state(at=REACHED, extrinsic=extrinsic))
+    assert [line.text for line in view.result if line.name == "angles"] == [
+        words
+    ]
+    assert words not in fragment(view_of(state(extrinsic=extrinsic)))
+
+
+def test_the_end_names_the_reason_why_nothing_is_saved():
+    ended = replace(state(), has_ended=True, can_save=False)
+    assert view_of(ended).text == (
+        "The node has ended. The result is not saved, because output_directory is not set."
+    )
+
+
+def test_the_age_of_a_shift_does_not_grow_after_the_end():
+    ended = replace(
+        mount(
+            shift={"x": 0.1},
+            shift_sigma={"x": 0.01},
+            since_ns=1,
+            newest_ns=74 * 10**9,
+        ),
+        has_ended=True,
+    )
+    assert view_of(ended).facts == "moved 74 s before the last motion"

@@ -15,7 +15,7 @@ from ros_harness import PATIENCE_S, RELIABLE_INPUTS, drive
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.plain import json_text
-from hand_eye_calib.core.results.parts import facts_of
+from hand_eye_calib.core.results.parts import brief_facts_of
 from hand_eye_calib.online.live.state import JournalState, Level, NodeState
 from hand_eye_calib.online.ros.watcher import Watcher
 from hand_eye_calib.online.watch.board import Board, state_of
@@ -123,12 +123,11 @@ def test_a_person_sees_the_session_from_the_first_message_to_done(
     shown = events.getresponse().readline().decode()
     assert "pose of camera in lidar" in shown
     assert "DONE" in shown
-    # The state, the page and the saved result state the same smallest errors.
+    # The page and the saved result state the same smallest errors. The page is short.
     saved = hec.load(tmp_path / "out")
-    errors, shifts = facts_of(saved)
-    assert "Errors larger than" in errors
+    (errors,) = brief_facts_of(saved)
+    assert "Errors above" in errors
     assert errors in unescape(shown)
-    assert shifts in unescape(shown)
     assert saved.detectability.errors["x"] < 0.2
 
     node.stop()

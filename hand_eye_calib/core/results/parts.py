@@ -93,6 +93,10 @@ class Part:
         """Return further lines about the part, for a user who requests all details."""
         return []
 
+    def brief_facts(self, value: Any, result: Any) -> list[str]:
+        """Return the facts as short lines, for a person next to the robot."""
+        return self.facts(value, result)
+
     def files(self, value: Any, result: Any) -> dict[str, str]:
         """Return files to be saved beside a usable result: their names and texts."""
         return {}
@@ -120,6 +124,14 @@ def facts_of(result: Any, *without: str) -> list[str]:
     for name, value in result.parts.items():
         if name not in without:
             facts += part(name).facts(value, result)
+    return facts
+
+
+def brief_facts_of(result: Any) -> list[str]:
+    """Return short lines about the parts of a result."""
+    facts = []
+    for name, value in result.parts.items():
+        facts += part(name).brief_facts(value, result)
     return facts
 
 

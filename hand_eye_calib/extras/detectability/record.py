@@ -120,6 +120,29 @@ class DetectabilityPart(Part):
             )
         return facts
 
+    def brief_facts(
+        self, value: Detectability | None, result: Any
+    ) -> list[str]:
+        """Return a sentence about the largest errors that would have been noticed."""
+        if value is None:
+            return []
+        largest = []
+        for axes in (AXES[:3], AXES[3:]):
+            sizes = {axis: value.errors.get(axis, math.inf) for axis in axes}
+            finite = [axis for axis in axes if math.isfinite(sizes[axis])]
+            if not finite:
+                continue
+            text = amount(axes[0], max(sizes[axis] for axis in finite))
+            if len(finite) < len(axes):
+                names = listing([ABOUT.get(axis, axis) for axis in finite])
+                text += (
+                    f" about {names}" if axes[0] in ABOUT else f" along {names}"
+                )
+            largest.append(text)
+        if not largest:
+            return []
+        return [f"Errors above {' or '.join(largest)} would have been noticed"]
+
 
 def _of_streams(value: Detectability) -> str:
     """Return the detectable errors of clock and scale; empty if there are none."""

@@ -62,7 +62,7 @@ def _no_digests(path: Path) -> str:
     """Return the sentence about a path without digests: the cause, and what writes digests."""
     return (
         f"{path} has none: the node writes them into {FOLDER}/ of its output_directory if monitor "
-        "and installed are set"
+        "and installed are set, at the end of a session with enough motion to learn the noise"
     )
 
 

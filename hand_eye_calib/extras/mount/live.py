@@ -89,10 +89,13 @@ class MountWatch:
         """Write the digest. Return whether this succeeded, and a line of text for the user."""
         digest = self._monitor.digest(*self._frames) if self._monitor else None
         if digest is None:
-            return (
-                False,
-                "no digest of the mount yet: the noise is being learned",
+            seconds = self._monitor.seconds if self._monitor else 0
+            text = (
+                f"no digest of the mount: {seconds} of the {TUNING.learning_s} s of motion that "
+                "are needed to learn the noise"
             )
+            self._log.warning(text)
+            return False, text
         try:
             path = write_digest(directory, digest)
         except OSError as error:

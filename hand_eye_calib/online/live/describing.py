@@ -17,7 +17,11 @@ from hand_eye_calib.core.base.text import duration, in_sentences, listing
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.core.results.context import Comparison
-from hand_eye_calib.core.results.parts import facts_of
+from hand_eye_calib.core.results.document import (
+    angles_in_words,
+    transforms_of,
+)
+from hand_eye_calib.core.results.parts import brief_facts_of
 from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.online.live.brief import of_reason
 from hand_eye_calib.online.live.progress import AXIS_KEYS
@@ -236,7 +240,8 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         time_offset_s=result.time_offset_s,
         scale=result.scale,
         age_s=age_s,
-        facts=tuple(facts_of(result)),
+        facts=tuple(brief_facts_of(result)),
+        angles=angles_in_words(transforms_of(result)["T_parent_child"], result),
         caution=problem,
         step=step,
     )

@@ -101,7 +101,9 @@ class ResultState:
         x, y, z (m), roll, pitch, yaw (rad) as printed, and standard deviations. None for an axis
         that is not determined.
     facts : tuple of str
-        Sentences about the evidence, such as the smallest error that would have been noticed.
+        Short sentences about the evidence, such as the smallest error that would have been noticed.
+    angles : str
+        Sentence about angles that are less or more certain than the rotation; empty if none is.
     caution, step : str
         The gravest reason for the verdict and the next step, in a few words; empty for ``USE``.
     age_s : float
@@ -121,6 +123,7 @@ class ResultState:
     scale: float
     age_s: float
     facts: tuple[str, ...] = ()
+    angles: str = ""
     caution: str = ""
     step: str = ""
 
@@ -339,6 +342,8 @@ class NodeState:
         Newest save of the session.
     has_ended : bool
         Whether the node ends, so that this is its last state.
+    can_save : bool
+        Whether the node has an output directory.
     headline : str
         First action of a person. ``watch`` and the log contain the same text.
     """
@@ -352,6 +357,7 @@ class NodeState:
     journal: JournalState | None = None
     saved: SavedState | None = None
     has_ended: bool = False
+    can_save: bool = True
     headline: str = ""
 
     @property

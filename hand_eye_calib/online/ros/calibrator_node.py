@@ -384,6 +384,7 @@ class CalibratorNode(ManagedNode):
             checks=cycle.checks.state(),
             journal=self._session.journal_state(self._options.node),
             saved=self._saver.state,
+            can_save=bool(self._options.node.output_directory),
         )
 
     # --------------------------------------------------------------- session

@@ -202,7 +202,7 @@ def _view(state: NodeState, silent_s: float) -> View:
         saved_in=state.saved.directory if state.saved else "",
     )
     if state.mount is not None:
-        return _with_mount(view, state.mount)
+        return _with_mount(view, state.mount, state.has_ended)
     view = _with_result(view, state)
     view = replace(view, facts=_facts(state, is_old))
     if progress := state.progress:
@@ -230,11 +230,14 @@ def _with_result(view: View, state: NodeState) -> View:
     return view
 
 
-def _with_mount(view: View, mount: MountState) -> View:
+def _with_mount(view: View, mount: MountState, has_ended: bool) -> View:
     """Add the mount to the view of a node that monitors the mount."""
     facts = f"{duration(mount.seconds_of_motion)} of motion seen"
     if mount.since_ns and mount.newest_ns:
-        facts = f"{duration((mount.newest_ns - mount.since_ns) * 1e-9)} ago"
+        since = duration((mount.newest_ns - mount.since_ns) * 1e-9)
+        facts = f"{since} ago"
+        if has_ended:
+            facts = f"moved {since} before the last motion"
     view = replace(
         view,
         facts=facts,
@@ -351,6 +354,8 @@ def _result(state: NodeState, view: View) -> Iterator[Line]:
     if result:
         for warning in result.warnings:
             yield Line(Tone.ACT, "note", typeset(warning))
+        if view.word == DONE and result.angles:
+            yield Line(Tone.BUSY, "angles", typeset(result.angles))
         # The reasons of another verdict contain the same numbers.
         if view.word == DONE and result.verdict == "USE":
             for fact in result.facts:

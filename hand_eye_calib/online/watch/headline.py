@@ -392,11 +392,14 @@ def _end(state: NodeState) -> Headline:
             Tone.ACT, "ENDED", f"{text}: the mount is not monitored."
         )
     if saved is None:
-        reason = (
-            "The result is not saved: the log contains the reason."
-            if state.result
-            else "There was no result yet. Start it again to go on."
-        )
+        if not state.result:
+            reason = "There was no result yet. Start it again to go on."
+        elif state.can_save:
+            reason = "The result is not saved: the log contains the reason."
+        else:
+            reason = (
+                "The result is not saved, because output_directory is not set."
+            )
         return Headline(Tone.ACT, "ENDED", f"{text}. {reason}")
     saved_text = f"The result was saved at {_time_of(saved)}."
     caution = _caution(state.result) if state.result else ""
