@@ -87,6 +87,7 @@ REFUSED = {
         name
         for name in VALUES
         if name.startswith(("parent_", "child_", "prior."))
+        and not name.endswith("_kind")
     },
     "together": set(),
 }
