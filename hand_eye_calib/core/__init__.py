@@ -18,7 +18,8 @@ def register() -> None:
     MEASURES["poses"] = Measure("poses")
     MEASURES["positions"] = Measure(
         "positions",
-        "positions determine a lever arm only beside poses of the other sensor",
+        "positions determine a lever arm only beside poses of the other sensor; give "
+        "positions with orientations for one of the two",
     )
     MEASURES["rotations"] = Measure("rotations")
     MEASURES["rates"] = Measure("rotations")

@@ -61,6 +61,7 @@ TABLE = """
 2 | calibrate drive.mcap --stamps now | invalid choice: 'now' (choose from
 2 | calibrate lidar.tum camera.tum --stamps receive | --stamps applies to bags only
 2 | calibrate lidar.tum camera.tum --max-gap fast | --max-gap: must be a number in s; got 'fast'
+2 | calibrate lidar.tum camera.tum --max-gap 0,5 | got '0,5'; write 0.5
 2 | calibrate lidar.tum camera.tum --max-gap -1 | --max-gap: must be at least 0.001 s; got -1.0
 2 | calibrate lidar.tum camera.tum --max-gap nan | --max-gap: must be a finite number; got nan
 2 | calibrate lidar.tum camera.tum --max-gab 1 | did you mean --max-gap?
@@ -122,6 +123,8 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --stamp-unit nss | did you mean ns?
 2 | calibrate lidar.tum camera.tum --target-translation far | must be numbers in m or cm or mm
 1 | calibrate drive.mcap --parent-topic /cam --child-topic /lidar/odometry | no topic /cam in
+1 | arm kuka.csv camera.tum | A, B and C seem to be angles of a robot; name its maker
+2 | calibrate lidar.tum camera.tum --config topic.yaml | is no parameter; give --parent-topic TOPIC
 2 | arm lidar.tum | lidar.tum contains no samples of an arm: expected a file that ends in
 2 | arm folder | folder contains no samples of an arm
 2 | arm lidar.tum lidar.tum | appears twice
@@ -237,6 +240,8 @@ TEXTS = {
     "typo.yaml": "max_gapp: 1\n",
     "value.yaml": "max_gap: fast\n",
     "other.yaml": "/talker:\n  ros__parameters:\n    rate: 3\n",
+    "topic.yaml": "parent_topic: /odom\n",
+    "kuka.csv": "X,Y,Z,A,B,C\n" + "0.1,0.2,0.3,10,20,30\n" * 20,
     "samples.yaml": "samples: []\n",
     "half.yaml": "- robot: [1, 0, 0, 0, 0, 0, 1]\n",
     "samples.npz": "junk",
@@ -383,6 +388,10 @@ IN_PYTHON = {
     "no parent": (
         lambda: hec.calibrate(None, LIDAR),
         "the parent must be a trajectory",
+    ),
+    "positions as poses": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns, LIDAR.poses[:, :3, 3]),
+        "for positions alone, use Trajectory.from_positions",
     ),
     "stamps in seconds": (
         lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),

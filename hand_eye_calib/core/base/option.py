@@ -19,6 +19,7 @@ OptionField: TypeAlias = dataclasses.Field[Any]
 LARGEST_INT = 1 << 63
 
 # Number with a unit, such as 35ms or -0.1 s.
+_DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
 _NUMBER_WITH_UNIT = re.compile(
     r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)"
 )
@@ -191,13 +192,15 @@ def _expected(field: OptionField) -> str:
 
 
 def _without_unit(value: object, unit: str) -> str:
-    """Return ``; write 0.035`` for a text such as ``35ms``; empty if it has another form.
+    """Return ``; write 0.035`` for a text such as ``35ms`` or ``0,035``.
 
-    ``unit`` is the unit of the option.
+    ``unit`` is the unit of the option. The return value is empty if the text has another form.
     """
-    match = (
-        _NUMBER_WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
-    )
+    if not isinstance(value, str):
+        return ""
+    if _DECIMAL_COMMA.fullmatch(value):
+        return f"; write {value.replace(',', '.')}"
+    match = _NUMBER_WITH_UNIT.fullmatch(value)
     factors = FACTORS_TO_SI.get(unit, {})
     if match is None or match[2] not in factors:
         return ""

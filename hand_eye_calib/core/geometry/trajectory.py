@@ -194,9 +194,15 @@ class Trajectory(Columns):
                 f"found shape {stamps_ns.shape} of {stamps_ns.dtype}{hint}"
             )
         if poses.shape != (len(stamps_ns), 4, 4):
+            hint = ""
+            if poses.shape == (len(stamps_ns), 3):
+                hint = (
+                    ": for positions alone, use "
+                    "Trajectory.from_positions(stamps_ns, positions)"
+                )
             raise InputError(
                 f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; "
-                f"found {poses.shape}"
+                f"found {poses.shape}{hint}"
             )
         if self.measures not in MEASURES:
             raise InputError(

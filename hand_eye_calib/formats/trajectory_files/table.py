@@ -152,6 +152,11 @@ class Table:
             no_pose = (
                 " (accelerations contain no pose)" if has_accelerations else ""
             )
+            if {"a", "b", "c"} <= {name.strip().lower() for name in self.names}:
+                raise InputError(
+                    f"{self.path}: the columns A, B and C seem to be angles of a robot; name "
+                    "its maker, such as hand_eye_calib arm HAND CAMERA --parent-angles kuka"
+                )
             raise InputError(
                 f"{self.path}: no column for {', '.join(missing)} among "
                 f"{listed}{no_pose}; name all columns with `columns`, such as "

@@ -30,6 +30,9 @@ _ROS_OPTIONS = (
 # Names of nodes in a parameter file whose section is for the calibrator.
 _NODES = ("calibrator", "**", "*", "")
 
+# Options of the command line that choose topics. The node has remaps instead.
+_TOPICS = ("parent_topic", "child_topic")
+
 # Key of the parameters of a node in a parameter file.
 _ROS_SECTION = "ros__parameters"
 
@@ -124,6 +127,13 @@ def _option_in_file(
 
 def _unknown_option(path: Path, option: str) -> ConfigError:
     """Return the error about an unknown option in a file of options."""
+    if option in _TOPICS:
+        typed = f"--{option.replace('_', '-')}"
+        remap = option.replace("_topic", "_odom")
+        return ConfigError(
+            f"{path}: {option!r} is no parameter; give {typed} TOPIC (for the node: "
+            f"-r {remap}:=TOPIC)"
+        )
     # Quotes protect the names from as_typed(), so that they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
     hint = (
