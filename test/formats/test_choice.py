@@ -108,7 +108,7 @@ def test_the_stream_that_is_not_named_is_chosen_alone():
             [LIDAR, ("/joint_states", JOINTS, 900)],
             (),
             ". If /lidar/odometry is not computed from the wheels, /joint_states is the other "
-            "stream",
+            "stream; otherwise record the odometry of a second sensor",
             {"parent_topic": "/joint_states", "child_topic": "/lidar/odometry"},
         ),
         (

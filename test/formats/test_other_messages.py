@@ -325,7 +325,7 @@ def test_fields_of_a_place_are_positions(bag):
         (
             "/array?t=header.stamp,x=pose.position.x,y=a,z=b",
             InputError,
-            "has no pose.position.x",
+            "has no pose.position.x; name other fields \\(the message has ",
         ),
         ("/array?t", ConfigError, "fields must be NAME=PATH"),
         (

@@ -286,7 +286,7 @@ def _partners_of(
     if len(names) == 1 and wheels:
         problem += (
             f". If {sensor.name} is not computed from the wheels, {wheels[0].name} is "
-            "the other stream"
+            "the other stream; otherwise record the odometry of a second sensor"
         )
         # Wheels are the parent.
         names = [wheels[0].name, *names]

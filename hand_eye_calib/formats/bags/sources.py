@@ -12,7 +12,8 @@ wz) are integrated to poses. A target is written ``/camera/image_raw?charuco:5x7
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import fields as fields_of
+from dataclasses import is_dataclass, replace
 from decimal import Decimal
 from typing import Any
 
@@ -25,7 +26,7 @@ from hand_eye_calib.core.base.errors import (
     NoPoseError,
     printable,
 )
-from hand_eye_calib.core.base.text import frame_name, without_poses
+from hand_eye_calib.core.base.text import frame_name, listing, without_poses
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
 from hand_eye_calib.formats.bags import messages, unpacking
@@ -306,6 +307,19 @@ class PathReading(Reading):
         return self._stamped(table[~is_null])
 
 
+def _fields_in_words(message: Any) -> str:
+    """List the fields of a decoded message, in parentheses; empty if they are unknown."""
+    if not is_dataclass(message):
+        return ""
+    # Names that begin with an underscore describe the type of the message.
+    names = [
+        field.name
+        for field in fields_of(message)
+        if not field.name.startswith("_")
+    ]
+    return f" (the message has {listing(names)})"
+
+
 class FieldReading(Reading):
     """Read fields that the user names, in messages of any type.
 
@@ -365,6 +379,7 @@ class FieldReading(Reading):
         except (AttributeError, IndexError, TypeError):
             raise InputError(
                 f"{self.name}: a message has no {'.'.join(path)}; name other fields"
+                f"{_fields_in_words(message)}"
             ) from None
         stamp_ns = messages.ns_of(value)
         return (
