@@ -512,3 +512,16 @@ def test_the_age_of_a_shift_does_not_grow_after_the_end():
         has_ended=True,
     )
     assert view_of(ended).facts == "moved 74 s before the last motion"
+
+
+def test_after_an_alarm_an_uncertain_axis_is_not_called_unmoved():
+    document = mount(
+        shift={"x": 0.7, "y": 0.0},
+        shift_sigma={"x": 0.1, "y": 0.25},
+        visible_10min={"x": 0.017, "y": 0.017},
+    )
+    (line,) = (
+        line for line in view_of(document).watched if line.name == "along y"
+    )
+    assert line.text == "cannot tell (± 25 cm)"
+    assert line.tone is Tone.UNKNOWN

@@ -46,7 +46,8 @@ _GRAVITY = ("bad", "warn", "good")
 _HEIGHT = 3.9
 _CAPTION = (
     "Difference of each recording from the common value along and about the parent's axes, "
-    "with its standard deviation. The band is three standard deviations of the common value, "
+    "with its standard deviation, which includes the usual scatter between recordings. "
+    "The band is three standard deviations of the common value, "
     "without the allowance for constant errors, which all recordings share. "
     "Squares do not belong to the others."
 )

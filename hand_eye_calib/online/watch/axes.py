@@ -138,6 +138,9 @@ def mount_line(axis: str, mount: MountState) -> Line:
     if abs(shift) > LARGEST_OF_SIX * sigma:
         tone = Tone.BAD
         text = f"moved by {amount(axis, shift)} ± {amount(axis, sigma)}"
+    elif visible is not None and visible < sigma < math.inf:
+        # The alarm is about other axes, and a large shift makes the noise of all axes larger.
+        text = f"cannot tell (± {amount(axis, sigma)})"
     elif visible is not None:
         tone = Tone.GOOD
         text = f"not moved (detects {amount(axis, visible)})"
