@@ -298,9 +298,10 @@ def _about(faulty: Sequence[Outcome]) -> str:
     return (
         f"{len(faulty)} calibrations with `{methods}`: of simulated hilly "
         "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
-        "whose answer without the fault counts as the truth. z is the largest error of an axis "
-        "in its standard deviations with the floor. Verdicts and the three most frequent "
-        "findings are counted: `no` is DO NOT USE, `care` USE WITH CARE."
+        "whose answer without the fault counts as the truth. z is the largest error of an "
+        "axis, divided by its standard deviation with the allowance. Verdicts "
+        "and the three most frequent findings are counted: `no` is DO NOT USE, "
+        "`care` USE WITH CARE."
     )
 
 

@@ -10,9 +10,11 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 
 
 class Errors(NamedTuple):
-    """Mean relative translation (m) and rotation errors (rad) over the motion pairs, which need no
-    ground truth and do not tell which of two calibrations is nearer to it; and absolute ones
-    against the ground truth.
+    """Errors of a calibration: translations (m) and rotations (rad).
+
+    ``e_rt`` and ``e_rR`` are the mean relative errors over the motion pairs. They need no ground
+    truth, and do not decide which of two calibrations is nearer to the truth. ``e_at`` and ``e_aR``
+    are the absolute errors against the ground truth.
     """
 
     e_rt: float

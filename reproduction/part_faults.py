@@ -297,7 +297,10 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
 
 
 def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
-    """Rates that were computed from the orientations of the parent, as a TF tree does."""
+    """Return rates that are differentiated from the parent's orientations.
+
+    A static transform of a TF tree has turned the orientations by ``rotation``.
+    """
     orientations = se3.rotation_of(parent.poses) @ rotation
     steps = se3.rotations_between(orientations[:-1], orientations[1:])
     stamps_ns = parent.stamps_ns

@@ -76,8 +76,8 @@ ZERO_SIGMAS = 3.0
 _SAME_POSITION_M = 0.002
 # Two sensors with different orientations are a warning below this length (m).
 _NEARLY_M = 0.012
-# Two sensors with parallel axes are suspicious below this length (m): parallel axes are no
-# accident.
+# Two streams with parallel axes are suspicious below this length (m). Two real sensors are hardly
+# parallel to 0.3 deg, so both streams probably describe one frame.
 _PARALLEL_M = 0.03
 
 # A gain about an axis is estimated only if the rotation about this axis (root mean square) is at

@@ -128,7 +128,8 @@ def check_copies(
         Whether the user declared both streams as exact, as for motion capture. Agreement to
         rounding is then a warning instead of an error, and noise is not compared.
     """
-    # A copy is interpolated at its own stamps. Either stream may be the copy.
+    # A copy was interpolated from its source at the stamps of the copy. Either stream may be the
+    # copy, so both are tried.
     pairs = [(streams.child, streams.parent) for streams in (given, aligned)]
     pairs += [(streams.parent, streams.child) for streams in (given, aligned)]
     residual_rad = min(

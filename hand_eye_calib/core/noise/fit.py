@@ -245,8 +245,9 @@ class Fit:
 
         White errors are split between both sensors in proportion to their covariances. All other
         errors, and the errors of outlier poses, are split into halves, because the covariances of
-        white noise do not apply to them. An error of centimetres, split by covariances of
-        millimetres, would become large and opposite rotations of both sensors.
+        white noise do not apply to them. Split by these covariances, a position error of
+        centimetres would be explained by large and opposite rotations of both sensors, because a
+        rotation moves the end of the lever arm.
 
         Parameters
         ----------

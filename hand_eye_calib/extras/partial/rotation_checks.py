@@ -63,8 +63,8 @@ _MIRRORED = 0.5
 # vectors. If all motion is about one axis, a reflection only changes the sign of the noise about
 # the other axes.
 _UNMIRRORED = 0.06
-# Duration (s) of these rotation vectors. Over a second, a matrix could not mirror them, because
-# they are too long.
+# Duration (s) of the motions with these rotation vectors. Only short rotation vectors are mirrored
+# as rates are. Those of motions of 1 s are too long.
 _MIRRORED_S = 0.5
 
 # Orientations are inverted only if the inversion leaves at most this share of the rotation

@@ -251,7 +251,9 @@ def _vectors_of_one_sign(rotations: FloatArray) -> FloatArray:
 _VECTORS = "rotation vectors"
 _FIXED = "angles about the fixed axes x, y, z (roll, pitch, yaw)"
 _MOVING = "angles about the moving axes x, y, z"
-_REVERSED = "angles about the fixed axes x, y, z in the order yaw, pitch, roll (A, B, C)"
+_REVERSED = (
+    "angles about the fixed axes x, y, z, listed as yaw, pitch, roll (A, B, C)"
+)
 
 # For each kind of angles, the function from three numbers (N, 3) to rotations (N, 3, 3).
 _ROTATIONS_OF: dict[str, _Conversion] = {

@@ -259,8 +259,8 @@ def _problem_and_sources(
     if len(frames - worlds) >= n_missing:
         listed = shortened(listing(sorted(edges)), _LONGEST_LIST)
         problem = (
-            f"{no_poses}, and the transforms share a frame ({listed}; if two sensors "
-            "measured them, name both)"
+            f"{no_poses}; the transforms share a frame, so they may all be from one sensor "
+            f"({listed}; if two sensors measured two of them, name these two)"
         )
         return problem, []
     partial = _partial_topic(topics) if n_missing == 1 else None
