@@ -120,7 +120,7 @@ def test_what_is_written_reads_back_to_the_last_bit_of_stamp_and_translation(
         (["0 1 2 3 0 0 0 1 9"], "line 1: expected 8 numbers, .* found 9"),
         (
             [f"0 {POSE}", "", "1 1 2 3"],
-            "line 3: expected 8 numbers, .* found 4: '1 1 2 3'",
+            "line 3, the last line, is cut: 4 of 8 numbers",
         ),
         (["0 1 2 x 0 0 0 1"], "line 1: expected 8 numbers, .* 'x'"),
         ([f"now {POSE}"], "line 1: .* found 'now' for the timestamp"),

@@ -1,5 +1,6 @@
 """Find the storage files of a bag, unpack them and open them."""
 
+import shlex
 import shutil
 import sqlite3
 import tempfile
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import listing, share
 from hand_eye_calib.formats import files
+from hand_eye_calib.formats.bags.roles import parent_and_child
 from hand_eye_calib.formats.bags.storage import (
     REPAIRS,
     RosbagsFile,
@@ -22,6 +24,11 @@ from hand_eye_calib.formats.bags.storage import (
     zstd_module,
 )
 from hand_eye_calib.formats.saved_results import refuse_saved_result
+from hand_eye_calib.formats.trajectory_files.file_options import (
+    AUTO,
+    FileOptions,
+)
+from hand_eye_calib.formats.trajectory_files.text_files import read_table
 from hand_eye_calib.formats.yaml_files import read_yaml
 
 # Possible paths of a bag, for messages.
@@ -34,6 +41,10 @@ _UNFINISHED = ("-wal", "-journal")
 _METADATA = "metadata.yaml"
 # Largest number of missing files that a message lists by name.
 _MOST_NAMED = 5
+# Suffixes of files that may be trajectories.
+_TABLES = (".tum", ".csv", ".txt", ".tsv")
+# Largest number of such files that are read in a folder without a bag.
+_MOST_TABLES = 20
 
 
 def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
@@ -174,6 +185,13 @@ def _no_files(folder: Path) -> str:
             "bag"
         )
     refuse_saved_result(folder)
+    trajectories = _trajectories_in(folder)
+    if len(trajectories) > 1:
+        task = "run" if len(trajectories) == 2 else "for two of them, run"
+        return (
+            f"no bag in {folder}, but {len(trajectories)} trajectory files; {task}: hand_eye_calib "
+            f"calibrate {shlex.join(map(str, trajectories[:2]))} (parent first)"
+        )
     advice = "check the path"
     for subfolder in sorted(
         file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]
@@ -182,6 +200,24 @@ def _no_files(folder: Path) -> str:
             advice = f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
             break
     return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
+
+
+def _trajectories_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are trajectories with stamps, the likeliest parent first.
+
+    Of files with the same stem, only one is returned.
+    """
+    trajectories = {}
+    candidates = [
+        path for path in sorted(folder.iterdir()) if path.suffix in _TABLES
+    ]
+    for path in candidates[:_MOST_TABLES]:
+        with suppress(InputError):
+            table = read_table(path, FileOptions(format=AUTO))
+            if table.stamps and table.at:
+                trajectories[path.stem] = path
+    stems = parent_and_child([*trajectories], {}, {})
+    return [trajectories[stem] for stem in stems]
 
 
 class MissingFiles(NamedTuple):

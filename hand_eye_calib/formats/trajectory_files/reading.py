@@ -37,6 +37,7 @@ from hand_eye_calib.formats.trajectory_files.poses import poses_of
 from hand_eye_calib.formats.trajectory_files.stamps import (
     in_order,
     refuse_coarse,
+    refuse_milliseconds,
     stamps_in_ns,
 )
 from hand_eye_calib.formats.trajectory_files.table import Table
@@ -247,6 +248,12 @@ def read_trajectory_files(
         table = read_table(path, options)
         readings[number] = _read(
             table, options, rows_of_tables[number], convention
+        )
+    if pair_by == PAIR_BY[0]:
+        refuse_milliseconds(
+            tables,
+            [reading.trajectory.stamps_ns for reading in readings],
+            [options.stamp_unit for _, options in files],
         )
     names = _sensor_names([path for path, _ in files])
     return [

@@ -1,14 +1,16 @@
 """Stamps of a table: conversion to whole nanoseconds, and order."""
 
+from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
-from hand_eye_calib.core.base.config import STAMP_UNITS
+from hand_eye_calib.core.base.config import STAMP_UNITS, CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
+from hand_eye_calib.core.base.text import duration
 from hand_eye_calib.formats.trajectory_files.dates import (
     DAY_S,
     WEEK_S,
@@ -23,6 +25,8 @@ _NS = STAMP_UNITS["s"]
 # If the median time between poses (s) is longer than this, the unit of the stamps is probably
 # wrong.
 _LONGEST_INTERVAL_S = 10
+# Rates and durations of two sensors of one recording usually differ by less than this factor.
+_SIMILAR = 3
 # Dates with a time of day as a number, such as 20231114221320.5, are at least this: 2000-01-01.
 _FIRST_PACKED = Decimal(20_000_101_000_000)
 # Dates with a time of day as a number are below this: 2100-01-01.
@@ -130,6 +134,52 @@ def _refuse_unclear_unit(
             f"{recognised}, the poses are {median(intervals_s):.4g} s apart; "
             "set `stamp_unit` to s, ms, us or ns"
         )
+
+
+def refuse_milliseconds(
+    tables: Sequence[Table],
+    stamps_ns: Sequence[IntArray],
+    units: Sequence[str | None],
+) -> None:
+    """Raise an InputError if the stamps of a table were read in s, but are probably in ms.
+
+    Read in s, they would be about 1,000 times as far apart as those of another table, and last
+    about 1,000 times as long, so that few of them are within the duration of the other table.
+
+    Parameters
+    ----------
+    tables : sequence of Table
+    stamps_ns : sequence of (N,) array of int64
+        Stamps of each table in order.
+    units : sequence of str or None
+        Unit of the stamps of each table that the user set, or None.
+    """
+    spans_s = [float(stamps[-1] - stamps[0]) / _NS for stamps in stamps_ns]
+    intervals_s = [
+        span_s / len(stamps)
+        for span_s, stamps in zip(spans_s, stamps_ns, strict=True)
+    ]
+    slow = int(np.argmax(intervals_s))
+    interval_s, span_s = intervals_s[slow], spans_s[slow]
+    if units[slow] or tables[slow].stamp_unit:
+        return
+    few_s = CalibratorConfig.min_pairs * interval_s
+    for other_interval_s, other_span_s in zip(
+        intervals_s, spans_s, strict=True
+    ):
+        is_apart = _is_near_thousand(interval_s, other_interval_s)
+        is_longer = _is_near_thousand(span_s, other_span_s)
+        if is_apart and is_longer and other_span_s < few_s:
+            raise InputError(
+                f"{tables[slow].path}: one pose every {interval_s:.3g} s for {duration(span_s)}: "
+                "its stamps look like milliseconds; give `stamp_unit` ms"
+            )
+
+
+def _is_near_thousand(longer: float, shorter: float) -> bool:
+    """Return whether the ratio of two times is about that of s and ms."""
+    expected = shorter * STAMP_UNITS["s"] / STAMP_UNITS["ms"]
+    return expected / _SIMILAR <= longer <= expected * _SIMILAR
 
 
 def _without_restarts(stamps_ns: IntArray, period_s: int) -> IntArray:

@@ -20,7 +20,12 @@ from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import shortened, shown_value
 from hand_eye_calib.formats.files import LONGEST_NAME
-from hand_eye_calib.formats.trajectory_files.cells import angle, is_null, number
+from hand_eye_calib.formats.trajectory_files.cells import (
+    angle,
+    is_null,
+    is_value,
+    number,
+)
 from hand_eye_calib.formats.trajectory_files.columns import (
     QUATERNION,
     ROTATION,
@@ -242,7 +247,12 @@ class Table:
             for (line_number, content), cells in zip(
                 numbered, rows, strict=True
             ):
-                self._add_row(cells, line_number, content)
+                try:
+                    self._add_row(cells, line_number, content)
+                except InputError:
+                    if line_number == line_numbers[-1] and not any(remaining):
+                        self._refuse_cut(cells, line_number)
+                    raise
         if 1 < len(self._sensors) <= _MOST_SENSORS:
             column = self.names[self._sensor_at[0]]
             raise InputError(
@@ -251,6 +261,15 @@ class Table:
                 "each sensor"
             )
         return self
+
+    def _refuse_cut(self, cells: Sequence[str], line_number: int) -> None:
+        """Raise an InputError if the last line has too few numbers, as in an incomplete file."""
+        is_short = len(cells) < len(self.names)
+        if is_short and self.n_rows and all(map(is_value, cells)):
+            raise InputError(
+                f"{self.path}, line {line_number}, the last line, is cut: {len(cells)} of "
+                f"{len(self.names)} numbers; copy the file again, or delete this line"
+            ) from None
 
     def fill_from_arrays(
         self, values: FloatArray, stamps: Sequence[Decimal | None] | None

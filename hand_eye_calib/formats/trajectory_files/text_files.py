@@ -222,24 +222,31 @@ def _add_times(table: Table, options: FileOptions) -> None:
     """
     if table.stamp_at:
         return
-    times = options.times
     path = Path(str(table.path)).with_name(_TIMES)
     is_auto = options.format == AUTO and not options.columns
-    if times is None and is_auto and path.is_file():
-        times = path
+    if options.times is not None:
+        mismatch = "they belong to different recordings"
+        table.stamps = _stamps_of(options.times, table, mismatch)
+    elif is_auto and path.is_file():
         table.guess(f"stamps read from {path}; to change this, set `times`")
-    if times is not None:
-        table.stamps = _stamps_of(times, table)
+        mismatch = (
+            f"{_TIMES} beside it was taken, because no column of stamps was found; name this "
+            "column t, or give the right stamps with `times`"
+        )
+        table.stamps = _stamps_of(path, table, mismatch)
 
 
-def _stamps_of(times: str | Path, poses: Table) -> list[Decimal]:
-    """Return the stamp of each pose, from a file with a stamp for each row of the poses."""
+def _stamps_of(times: str | Path, poses: Table, mismatch: str) -> list[Decimal]:
+    """Return the stamp of each pose, from a file with a stamp for each row of the poses.
+
+    ``mismatch`` ends the message about a file with another number of stamps.
+    """
     lines = lines_of(times, read_text(times, "stamps"), after=0)
     table = Table(times, ["t"], "stamps", "a stamp")
     table.fill(lines, lambda text: text.split()[:1])
     if len(table.stamps) != poses.n_rows:
         raise InputError(
             f"{poses.path}: {poses.n_rows} poses, but {times} has "
-            f"{len(table.stamps)} stamps; they belong to different recordings"
+            f"{len(table.stamps)} stamps; {mismatch}"
         )
     return [table.stamps[row] for row in poses.rows]

@@ -93,9 +93,15 @@ def misplaced(
 
 @argument_type
 def directory(text: str) -> Path:
-    """Return the directory of an option; a ConfigError if the text is empty."""
+    """Return the directory of an option; a ConfigError if the text is empty, or a file is there."""
     if not text.strip():
         raise ConfigError(
             f"the name is empty, got {shown_value(text)}: name a directory"
         )
-    return Path(text)
+    path = Path(text)
+    for folder in (path, *path.parents):
+        if folder.is_file():
+            raise ConfigError(
+                f"{folder} is a file; give a folder, such as drive/"
+            )
+    return path

@@ -1,0 +1,112 @@
+"""Wrong arguments in Python: an error of the package names the argument and what to pass."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import hand_eye_calib as hec
+
+SAMPLES = hec.read_arm_samples("sample:arm.yaml")
+LIDAR = hec.read_trajectory("sample:lidar.tum")
+RESULT = hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))
+IN_PYTHON = {
+    "no child": (
+        lambda: hec.calibrate(LIDAR),
+        "a child is missing: pass two trajectories",
+    ),
+    "no parent": (
+        lambda: hec.calibrate(None, LIDAR),
+        "the parent must be a trajectory",
+    ),
+    "positions as poses": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns, LIDAR.poses[:, :3, 3]),
+        "for positions alone, use Trajectory.from_positions",
+    ),
+    "stamps in seconds": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),
+        "multiply seconds by 1e9 and round them",
+    ),
+    "a number as prior": (
+        lambda: hec.CalibratorConfig(prior_z=1.85),
+        "prior.z must be a text with its standard deviation, such as '1.85",
+    ),
+    "a prior in degrees": (
+        lambda: hec.calibrate(LIDAR, LIDAR, prior={"yaw": (-62, 2)}),
+        "write '-62deg+/-2deg', or convert both numbers with np.deg2rad",
+    ),
+    "a text as target": (
+        lambda: hec.CalibratorConfig(target_translation="two"),
+        "target.translation must be a number in m; got 'two'",
+    ),
+    "names as text": (
+        lambda: hec.calibrate_arm(SAMPLES.robot, SAMPLES.tracking, names="abc"),
+        "names must be of type Mapping; got str",
+    ),
+    "words as poses": (
+        lambda: hec.robot_poses("abc", "kuka"),
+        "rows must be numbers; got str",
+    ),
+    "a method with two letters swapped": (
+        lambda: hec.CalibratorConfig(method="dnol"),
+        "got 'dnol'; did you mean dnlo or dnl?",
+    ),
+    "an offset with its unit": (
+        lambda: hec.CalibratorConfig(time_offset="-35 ms"),
+        "time_offset must be estimate or a number in s; got '-35 ms'; write -0.035",
+    ),
+    "a misspelt robot": (
+        lambda: hec.robot_poses([[0.0] * 6], "kuca"),
+        "did you mean kuka?",
+    ),
+    "files as poses": (
+        lambda: hec.calibrate_arm("hand.tum", "camera.tum"),
+        "robot: expected poses, not a path; read_arm_samples",
+    ),
+    "a matrix as installed": (
+        lambda: hec.compare([RESULT], installed=np.eye(3)),
+        "installed must be an earlier result, such as hec.load(DIR); got ndarray",
+    ),
+    "a result without a list": (
+        lambda: hec.compare(RESULT, RESULT),
+        "got Calibration: pass a list of results",
+    ),
+    "paths as results": (
+        lambda: hec.compare(["a", "b"]),
+        "got str: read a saved result with hand_eye_calib.load",
+    ),
+    "a list as a rig": (
+        lambda: hec.calibrate_rig(["a.tum", "b.tum", "c.tum"]),
+        "pass {name: trajectory} of all sensors",
+    ),
+    "a bag without a topic": (
+        lambda: hec.read_trajectory("sample:drive.mcap"),
+        "is a bag: name the topic of the bag",
+    ),
+    "one result": (
+        lambda: hec.compare([RESULT]),
+        "or one and the installed transform",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", IN_PYTHON)
+def test_a_wrong_argument_in_python_is_answered_in_one_line(name):
+    call, message = IN_PYTHON[name]
+    with pytest.raises(hec.HandEyeCalibError) as caught:
+        call()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_result_with_exchanged_frames_is_compared_as_its_inverse():
+    for comparison in (
+        hec.compare([RESULT, RESULT.inverse()]),
+        hec.compare([RESULT], installed=RESULT.inverse()),
+    ):
+        assert comparison.verdict == "same"
+        for row in comparison.differences[0].axes.values():
+            assert_allclose(row.difference, 0.0, atol=1e-9)
+    moved = dataclasses.replace(RESULT.inverse(), T_parent_child=np.eye(4))
+    assert hec.compare([RESULT, moved]).verdict == "moved"
