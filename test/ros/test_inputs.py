@@ -231,7 +231,8 @@ class TestRefusedInput:
         wrong = peer.publisher(NavSatFix, "child_odom")
         node.wait_for_log(
             "/child_odom is not used: positions determine a lever arm only beside poses of the "
-            "other sensor; the parent measures positions, the child positions"
+            "other sensor; give positions with orientations for one of the two; the parent "
+            "measures positions, the child positions"
         )
         peer.node.destroy_publisher(wrong)
         peer.wait_matched(peer.publisher(Odometry, "child_odom"))
