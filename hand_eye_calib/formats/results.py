@@ -353,7 +353,8 @@ def load_result(path: str | Path) -> Calibration:
     if path.suffix in (".tum", ".txt", ".csv") and path.exists():
         raise InputError(
             f"{path} is a file of poses, not a saved result: calibrate PARENT CHILD --out DIR "
-            f"saves a result in DIR; then compare DIR --with {path.name} compares it with one pose"
+            f"saves a result in DIR; then run info DIR, or compare DIR --with {path.name} if the "
+            "file has a single pose"
         )
     try:
         document = read_yaml(path)

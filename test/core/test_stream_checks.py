@@ -575,3 +575,15 @@ def test_an_offset_that_worsens_the_clocks_is_omitted(
     (found,) = check_offset(offset, added_s)
     assert (found.key, found.code) == (key, "time_offset")
     assert found.options == {"time_offset": pytest.approx(option)}
+
+
+@pytest.mark.parametrize("stream", ["parent", "child"])
+def test_a_stream_that_keeps_its_orientation_is_named(stream):
+    streams = dict(zip(("parent", "child"), drive(), strict=True))
+    poses = streams[stream].poses.copy()
+    poses[:, :3, :3] = np.eye(3)
+    streams[stream] = dataclasses.replace(streams[stream], poses=poses)
+    found = check_streams(**streams).findings[0]
+    assert found.code == "no_turning"
+    assert found.what.startswith(f"the {stream}'s orientation is the same")
+    assert f"{stream}_measures positions" in found.advice

@@ -104,7 +104,7 @@ TABLE = """
 1 | calibrate hole.tum camera.tum | hole.tum, line 1000: expected 8 numbers
 2 | calibrate lidar.tum camera.tum --label vehicle | expected NAME=VALUE, such as vehicle=7
 2 | calibrate lidar.tum camera.tum --base-frame base --method park | needs --installed ROBOT.urdf
-1 | calibrate lidar.tum camera.tum --parent-frame a --child-frame a | both streams name 'a'
+1 | calibrate lidar.tum camera.tum --parent-frame a --child-frame a | are both 'a'; give each
 2 | calibrate lidar.tum camera.tum --format kity | invalid choice: 'kity' (choose from 'tum'
 1 | calibrate lidar.tum camera.tum --columns t,x | no column for y, z, qx, qy, qz, qw among t, x
 1 | calibrate lidar.tum camera.tum --pair-by row | 1,200 in camera.tum: write a row
@@ -140,6 +140,7 @@ TABLE = """
 1 | calibrate drive.mcap --parent-topic /cam --child-topic /lidar/odometry | no topic /cam in
 1 | arm kuka.csv camera.tum | A, B and C seem to be angles of a robot; name its maker
 2 | calibrate lidar.tum camera.tum --config topic.yaml | is no parameter; give --parent-topic TOPIC
+2 | calibrate --parent lidar.tum --child camera.tum | without options, the parent first
 2 | arm lidar.tum | lidar.tum contains no samples of an arm: expected a file that ends in
 2 | arm folder | folder contains no samples of an arm
 2 | arm lidar.tum lidar.tum | appears twice

@@ -14,6 +14,7 @@ The poses of a stream are those of the sensor in its world, or the inverse poses
 assumption about both streams: poses or inverse poses.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -441,8 +442,33 @@ def _explain(
     if is_frozen:
         return None, []
     if correlation.variation < MIN_VARIATION:
-        return None, [finding("no_turning")]
+        return None, [_missing_rotation(streams)]
     return None, [finding("unrelated", doubt=correlation.doubt())]
+
+
+def _missing_rotation(streams: StreamPair) -> Finding:
+    """Return the finding that both streams hardly rotate, or that only one of them rotates."""
+    largest_rad = {}
+    for stream, trajectory in (
+        ("parent", streams.parent),
+        ("child", streams.child),
+    ):
+        rotations = se3.rotation_of(trajectory.poses)
+        from_first_rad = se3.rotation_angle(rotations[0].T @ rotations)
+        largest_rad[stream] = float(from_first_rad.max())
+    constant = min(largest_rad, key=largest_rad.__getitem__)
+    other = "child" if constant == "parent" else "parent"
+    if (
+        largest_rad[constant] > agreement.SAME_RAD
+        or largest_rad[other] < MIN_ROTATION_RAD
+    ):
+        return finding("no_turning")
+    return finding(
+        "only_one_turns",
+        stream=constant,
+        other=other,
+        degrees=math.degrees(largest_rad[other]),
+    )
 
 
 def _check_sizes(

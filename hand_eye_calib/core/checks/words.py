@@ -125,6 +125,12 @@ WORDS = {
         "be checked",
         "rotate about several axes (a vehicle: curves, and slopes if there are any)",
     ),
+    "only_one_turns": FindingWords(
+        "the {stream}'s orientation is the same in all poses, while the {other} turns by "
+        "{degrees:.0f} deg",
+        "export the orientations, too; for a sensor without them, give {stream}_measures positions",
+        code="no_turning",
+    ),
     "too_few_poses": FindingWords(
         "the {stream} stream has {poses} poses",
         "record longer",

@@ -156,6 +156,11 @@ class Snapshot:
                     f"the child stream of {self.child_names.sensor or nameless}; "
                     "exchange the two streams, or the two names"
                 )
+        if self.parent_names.option == self.child_names.option != "":
+            raise InputError(
+                f"parent_frame and child_frame are both {self.parent_frame!r}; give each sensor "
+                "its own frame, such as lidar and camera"
+            )
         if self.parent_frame == self.child_frame:
             raise InputError(
                 f"both streams name {self.parent_frame!r} as their sensor frame, so there is "

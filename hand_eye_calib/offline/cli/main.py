@@ -282,6 +282,11 @@ def _refuse(rest: Sequence[str], parser: argparse.ArgumentParser) -> NoReturn:
     owners = _commands_with(option) if options else {}
     if owners:
         parser.error(_option_of(owners, rest[rest.index(first) :]))
+    if option in ("--parent", "--child", "--parent-file", "--child-file"):
+        parser.error(
+            f"unknown {option!r}: give both files without options, the parent first: "
+            "hand_eye_calib calibrate PARENT CHILD"
+        )
     # Compare the names without dashes, which would make short names similar.
     known = [name.lstrip("-") for name in parser._option_string_actions]
     word = _SHORT_NAMES.get(option, option).lstrip("-")
