@@ -13,7 +13,7 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
-from hand_eye_calib.formats.bags.writer import write_streams
+from hand_eye_calib.formats.bags.writer import write_bag, write_streams
 from reproduction.machines import simulate_machine
 
 # Lidar to camera on the pages: x 0.4 m, z 1.85 m, yaw -90 deg.
@@ -68,7 +68,11 @@ def _write_drive(folder):
     imu_ns, rates = _rates(camera)
     places = _geodetic(camera)
     _write_bag(folder / "my_drive", lidar, camera, places, (imu_ns, rates))
-    _write_bag_of_two_lidars(folder / "my_yard", lidar, camera)
+    two_lidars = {
+        "/front/odometry": (lidar, _ODOMETRY),
+        "/rear/odometry": (camera, _ODOMETRY),
+    }
+    write_bag(folder / "my_yard", two_lidars)
     _write_ins(folder / "ins.csv", camera, places)
     columns = _after_times(camera.stamps_ns, places)
     _write_csv(folder / "gnss.csv", "time,latitude,longitude,height", columns)
@@ -170,17 +174,6 @@ def _write_bag(path, lidar, camera, places, rates):
             rates[0].tolist(), rates[1].tolist(), strict=True
         ):
             writer.write(connection, stamp_ns, imu(rate, stamp_ns=stamp_ns))
-
-
-def _write_bag_of_two_lidars(path, front, rear):
-    """Odometry of a front and a rear lidar."""
-    storage = rosbag2.StoragePlugin.MCAP
-    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
-        streams = {
-            "/front/odometry": (front, _ODOMETRY),
-            "/rear/odometry": (rear, _ODOMETRY),
-        }
-        write_streams(writer, streams, "mcap")
 
 
 def _write_ins(path, trajectory, places):

@@ -77,6 +77,7 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --prior yaw=90+/-2 | write 90deg for degrees
 2 | calibrate lidar.tum camera.tum --prior z=1+/-0 | needs a standard deviation above 0; got '0'
 2 | calibrate lidar.tum camera.tum --prior z=1kg+/-0.1 | numbers in m or cm or mm; got '1kg'
+2 | calibrate lidar.tum camera.tum --prior z=1deg+/-0.1 | or cm or mm; got '1deg' (see
 2 | calibrate lidar.tum camera.tum --target-axes z | z must be numbers in m or cm or mm
 2 | calibrate lidar.tum camera.tum --target-translation 0 | must be at least 1e-06 m; got 0.0
 1 | calibrate lidar.tum camera.tum --config absent.yaml | cannot read absent.yaml

@@ -428,8 +428,11 @@ def _quantity(name: str, unit: str, word: str) -> float:
     unit_of_word = _unit_of(word) or unit
     if not match or unit_of_word not in factors:
         allowed = " or ".join(factors)
-        point = word.replace(",", ".")
-        hint = f"; write {point}" if _QUANTITY.fullmatch(point) else ""
+        hint = ""
+        with_point = word.replace(",", ".")
+        if "," in word and (_unit_of(with_point) or unit) in factors:
+            is_number = _QUANTITY.fullmatch(with_point)
+            hint = f"; write {with_point}" if is_number else ""
         raise ConfigError(
             f"{name} must be numbers in {allowed}; got {shown_value(word)}{hint}"
         )

@@ -448,14 +448,10 @@ def _explain(
 
 def _missing_rotation(streams: StreamPair) -> Finding:
     """Return the finding that both streams hardly rotate, or that only one of them rotates."""
-    largest_rad = {}
-    for stream, trajectory in (
-        ("parent", streams.parent),
-        ("child", streams.child),
-    ):
-        rotations = se3.rotation_of(trajectory.poses)
-        from_first_rad = se3.rotation_angle(rotations[0].T @ rotations)
-        largest_rad[stream] = float(from_first_rad.max())
+    largest_rad = {
+        "parent": _largest_rotation(streams.parent),
+        "child": _largest_rotation(streams.child),
+    }
     constant = min(largest_rad, key=largest_rad.__getitem__)
     other = "child" if constant == "parent" else "parent"
     if (
@@ -577,14 +573,16 @@ def can_check(parent: Trajectory, child: Trajectory) -> bool:
     """
     if min(parent.duration_s, child.duration_s) < MIN_DURATION_S:
         return False
-    for stream in (parent, child):
-        rotations = se3.rotation_of(stream.poses)
-        if (
-            se3.rotation_angle(rotations[0].T @ rotations).max()
-            >= MIN_ROTATION_RAD
-        ):
-            return True
-    return False
+    return any(
+        _largest_rotation(stream) >= MIN_ROTATION_RAD
+        for stream in (parent, child)
+    )
+
+
+def _largest_rotation(trajectory: Trajectory) -> float:
+    """Return the largest rotation (rad) from the first pose to another pose."""
+    rotations = se3.rotation_of(trajectory.poses)
+    return float(se3.rotation_angle(rotations[0].T @ rotations).max())
 
 
 def _motions(pose_pairs: PosePairs, max_motions: int) -> MotionPairs:

@@ -298,8 +298,7 @@ def _calibration(
 
 def _note_on_identity(result: Calibration) -> tuple[str, ...]:
     """Return a note if the sensor seems to be at the origin of the vehicle, with its axes."""
-    x, y = result.T_parent_child[:2, 3]
-    yaw = np.arctan2(result.T_parent_child[1, 0], result.T_parent_child[0, 0])
+    x, y, _, _, _, yaw = se3.xyz_rpy(result.T_parent_child)
     is_near = np.hypot(x, y) < result.target_translation
     if not is_near or abs(yaw) > result.target_rotation:
         return ()

@@ -1,16 +1,16 @@
 """Nominal sizes of wheels: from a URDF, or from the parameters of a controller."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.text import listing
+from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import FrameTree
 from hand_eye_calib.extras.vehicle.joints import LEFT, RIGHT, is_wheel
 from hand_eye_calib.formats.files import read_bytes
@@ -152,21 +152,14 @@ def _pairs(
 
 def _separation(frames: FrameTree, left: Element, right: Element) -> float:
     """Return the distance (m) of two wheels along the axis of the left wheel."""
-    T_robot_left = _pose_in_robot(frames, _link_of(left))
-    T_robot_right = _pose_in_robot(frames, _link_of(right))
+    # The wheels move; their joints have these poses at zero.
+    at_zero = {
+        link: edge.pose
+        for link, edge in frames.edges.items()
+        if edge.pose is not None
+    }
+    T_left_right = frames.pose(_link_of(left), _link_of(right), at_zero)
     axis = np.array([1.0, 0.0, 0.0])
     for element in left.findall("axis"):
         axis = np.array(numbers_of(element.get("xyz", "1 0 0")))
-    between = T_robot_right[:3, 3] - T_robot_left[:3, 3]
-    return abs(float(between @ T_robot_left[:3, :3] @ axis))
-
-
-def _pose_in_robot(frames: FrameTree, link: str) -> FloatArray:
-    """Return the pose (4, 4) of a link in the root of the robot, with all joints at zero."""
-    T_root_link = np.eye(4)
-    steps: Sequence[str] = frames.above(link)
-    for step in steps[:-1]:
-        T_above_step = frames.edges[step].pose
-        if T_above_step is not None:
-            T_root_link = T_above_step @ T_root_link
-    return T_root_link
+    return abs(float(se3.translation_of(T_left_right) @ axis))

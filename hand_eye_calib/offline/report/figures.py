@@ -476,13 +476,14 @@ def _figure_of_residuals(
     if calibration.reference == "stops":
         units = _UNITS_OF_STOPS
         is_out = residuals.weights == 0.0
-        name_of_outlier = "left out"
+        name_of_outlier = outliers = "left out"
         items = "stops"
         times = np.arange(1.0, len(residuals) + 1)
         label = "stop"
     else:
         is_out = ~residuals.is_inlier
         name_of_outlier = "outlier"
+        outliers = "outliers"
         items = "motion pairs"
         if calibration.measured == "positions":
             items = "distances from one position to the next"
@@ -513,7 +514,6 @@ def _figure_of_residuals(
         if is_out.any()
         else "None"
     )
-    outliers = "left out" if items == "stops" else "outliers"
     caption = (
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
         f"of them to {listing(largest)}. {n_out} of them are {outliers}."
