@@ -12,7 +12,7 @@ from hand_eye_calib.core.noise import partwise, reml
 from hand_eye_calib.core.noise.normal import Factor, NormalEquations
 from hand_eye_calib.core.noise.outliers import (
     chi_squares,
-    innovation_chi_squares,
+    leave_one_out_chi_squares,
 )
 from hand_eye_calib.core.noise.partwise import PartwisePosterior
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
@@ -248,7 +248,7 @@ def test_derivatives_of_the_likelihood_are_the_numerical_ones():
     assert_allclose(information, 0.5 * forced @ P @ forced.T, atol=1e-7)
 
 
-def test_surprises_are_what_leaving_one_out_makes_of_it():
+def test_chi_squares_are_those_of_leaving_one_increment_out():
     no_spikes = np.zeros(N_POSES, dtype=bool)
     space = space_of(cut=())
     V = dense_covariance(space, LEVELS)
@@ -257,17 +257,17 @@ def test_surprises_are_what_leaving_one_out_makes_of_it():
     forces = (P @ r).reshape(-1, 6)
 
     posterior = Posterior(space, LEVELS)
-    of_walk, _ = innovation_chi_squares(posterior, no_spikes)
+    of_walk, _ = leave_one_out_chi_squares(posterior, no_spikes)
 
-    for i, surprise in enumerate(of_walk):
+    for i, chi_square in enumerate(of_walk):
         block = slice(6 * i, 6 * i + 6)
         own = P[block, block]
         force = forces[i]
         expected = force @ np.linalg.solve(own, force)
-        assert surprise == pytest.approx(expected, rel=1e-5)
+        assert chi_square == pytest.approx(expected, rel=1e-5)
     # An increment that is no evidence is judged by the same number.
     without = Posterior(space_of(cut=(6,)), LEVELS)
-    again, _ = innovation_chi_squares(without, no_spikes)
+    again, _ = leave_one_out_chi_squares(without, no_spikes)
     assert again[6] == pytest.approx(of_walk[6], rel=1e-5)
 
 
@@ -396,8 +396,8 @@ def test_parts_have_the_posterior_of_a_trajectory_that_is_cut_between_them(
         posterior.part_products().sum(axis=0), expected.products, atol=1e-9
     )
     no_spikes = np.zeros(N_POSES, dtype=bool)
-    of_walk, of_white = innovation_chi_squares(posterior, no_spikes)
-    whole_walk, whole_white = innovation_chi_squares(expected, no_spikes)
+    of_walk, of_white = leave_one_out_chi_squares(posterior, no_spikes)
+    whole_walk, whole_white = leave_one_out_chi_squares(expected, no_spikes)
     assert_allclose(of_white, whole_white, rtol=1e-6)
     assert_allclose(of_walk[~whole.cut], whole_walk[~whole.cut], rtol=1e-6)
     assert_array_equal(of_walk[whole.cut], 0.0)

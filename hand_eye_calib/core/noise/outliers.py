@@ -125,14 +125,14 @@ def _lengths(residuals: FloatArray) -> FloatArray:
     return np.linalg.norm(residuals.reshape(-1, 2, 3), axis=2)
 
 
-def innovation_chi_squares(
+def leave_one_out_chi_squares(
     posterior: Posterior | PartwisePosterior, spikes: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the chi-squares of the increments (n,) and of the poses' white errors (N,).
 
-    Each chi-square compares data with their prediction by all other data, earlier and later.
-    Outlier poses ``spikes`` (N,) are not used. An increment between two parts of a long recording
-    has the chi-square zero.
+    Each chi-square compares data with their prediction by all other data, earlier and later. Jumps
+    and the outlier poses ``spikes`` (N,) are not used for predictions, but have chi-squares, too.
+    An increment between two parts of a long recording has the chi-square zero.
     """
     of_walk = []
     of_white = []
@@ -149,7 +149,7 @@ def innovation_chi_squares(
 def _chi_squares_of_part(
     posterior: Posterior, spikes: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the chi-squares of :func:`innovation_chi_squares` for one part of a recording."""
+    """Return the chi-squares of :func:`leave_one_out_chi_squares` for one part of a recording."""
     space = posterior.space
     # Column 0 is the posterior mean. The other columns are a root of the covariance that the
     # uncertainty of the parameters adds.
@@ -162,6 +162,8 @@ def _chi_squares_of_part(
         space.cut,
     )
     white = states[:, :WHITE]
+    # An outlier pose has the weight 0 in the state space. Its chi-square belongs to the pose that
+    # replaces it; it matters only as a neighbour of other poses.
     weights = np.where(spikes, 1.0, space.weights)
     covariance = total_covariance(posterior.levels, space.white_bases)
     covariance_left = posterior.factor.selected_inverse[0][:, :WHITE, :WHITE]
@@ -212,7 +214,7 @@ def detect_outliers(
         Result of the previous detection. Its outlier poses remain outliers. Its jumps remain jumps
         if their chi-square is still large.
     of_walk, of_white : (n,) and (N,) arrays
-        Chi-squares of increments and of poses, see :func:`innovation_chi_squares`.
+        Chi-squares of increments and of poses, see :func:`leave_one_out_chi_squares`.
     tuning : Tuning
     with_spikes : bool
         Whether to detect new outlier poses.
@@ -260,10 +262,12 @@ def _is_peak(values: FloatArray) -> BoolArray:
 def bridge_outliers(
     streams: Streams, T_parent_child: FloatArray, spikes: BoolArray
 ) -> Streams:
-    """Replace each outlier pose of the child by its previous pose, moved like the parent.
+    """Replace the child's pose at each outlier by its previous pose, moved like the parent.
 
     The state space ignores the error of an outlier pose. But the increments on both sides are
-    linearised to first order, which a large error would make invalid.
+    linearised to first order, which a large error would make invalid. If the parent's pose is
+    wrong, the child's pose is replaced, too: both errors then agree. The first pose of a recording
+    has no previous pose and is not replaced.
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
     outlier_poses = np.flatnonzero(spikes[1:]) + 1
@@ -281,8 +285,9 @@ def tail_weights(posterior: Posterior | PartwisePosterior) -> FloatArray:
     """Return weights (N,) of the white errors v for Student's t distribution.
 
     ``weight = (nu + 6) / (nu + E[v' S^-1 v])``, with nu = 4 degrees of freedom and the white
-    covariance S. The expectation is v' S^-1 v of the smoothed v, plus a share that smoothing
-    removes. This share is assumed to be in inverse proportion to the weights of the poses.
+    covariance S. At the present weights u, v has the covariance S / u, and ``v' S^-1 v`` the mean
+    6 / u. The smoothed v^ is shorter than v: let r be the mean of ``u v^' S^-1 v^ / 6`` over all
+    poses, at most 1. Then ``E[v' S^-1 v] = v^' S^-1 v^ + 6 (1 - r) / u``.
     """
     return np.concatenate(
         [_tail_weights_of_part(part) for part in posterior.parts()]
@@ -291,12 +296,12 @@ def tail_weights(posterior: Posterior | PartwisePosterior) -> FloatArray:
 
 def _tail_weights_of_part(posterior: Posterior) -> FloatArray:
     """Return the weights of :func:`tail_weights` for one part of a recording."""
-    v = posterior.states_after(posterior.normal.step)[:, :WHITE]
-    squares = (v * se3.times(posterior.white_precision, v)).sum(axis=1)
+    smoothed = posterior.states_after(posterior.normal.step)[:, :WHITE]
+    forces = se3.times(posterior.white_precision, smoothed)
+    squares = (smoothed * forces).sum(axis=1)
     weights = posterior.space.weights
     is_outlier = weights == 0.0
     weighted_squares = (weights * squares)[~is_outlier]
-    # Without smoothing, v' S^-1 v has the mean 6.
     remaining_share = min(float(np.mean(weighted_squares)) / WHITE, 1.0)
     removed = (
         WHITE * (1.0 - remaining_share) / np.where(is_outlier, 1.0, weights)

@@ -54,7 +54,7 @@ from hand_eye_calib.core.noise.outliers import (
     bridge_outliers,
     detect_outliers,
     first_outliers,
-    innovation_chi_squares,
+    leave_one_out_chi_squares,
     tail_weights,
 )
 from hand_eye_calib.core.noise.partwise import PartwisePosterior
@@ -81,8 +81,9 @@ def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
     burst = np.array(tuning.burst)
     n_bursts = tuning.most_poses // len(burst)
     # A burst is at most twice as long as the distance between the starts of two neighbouring
-    # bursts.
-    offsets = burst[2 * len(burst) * n_poses // tuning.most_poses > burst]
+    # bursts, which is about n_poses / n_bursts.
+    longest_offset = 2 * len(burst) * n_poses // tuning.most_poses
+    offsets = burst[burst < longest_offset]
     starts = np.linspace(0, n_poses - 1 - offsets[-1], n_bursts).astype(int)
     return np.unique(starts[:, None] + offsets)
 
@@ -122,7 +123,8 @@ def _centre_of_rotations(
 ) -> str:
     """Return the centre (CENTRES) about which the translations of residuals (n, 6) are smallest.
 
-    White rotation errors turn about this centre.
+    White rotation errors turn about this centre. Of both sensors, only the child is tried: the
+    translations of the residuals are those of the child.
     """
     translations = residuals[:, :3]
     rotations = residuals[:, 3:]
@@ -141,7 +143,9 @@ def _centre_of_rotations(
 def noise(workspace: Workspace, fit: Fit) -> Fit:
     """Fit all levels of the model on a sample of the poses, then take a step of X on this sample.
 
-    Systematic errors stay constant.
+    The restricted likelihood marginalises X and all systematic errors, so that a systematic error
+    does not count as noise. The step changes X alone: which systematic errors are present is
+    decided later, by :func:`systematic`.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -190,7 +194,7 @@ def _detect_in_rounds(
             fit = fit.corrected(
                 problem.streams, _expected_states(workspace, fit)
             )
-        of_walk, of_white = innovation_chi_squares(
+        of_walk, of_white = leave_one_out_chi_squares(
             workspace.posterior(fit), fit.outliers.spikes
         )
         detected = detect_outliers(
@@ -242,8 +246,10 @@ def tails(workspace: Workspace, fit: Fit) -> Fit:
 def time_correlated(workspace: Workspace, fit: Fit) -> Fit:
     """Add time-correlated errors to the model if they lower the loss enough.
 
-    The search begins with all processes. Processes without information are dropped twice: after the
-    first steps, so that the remaining steps are faster, and at the end.
+    The search begins with all processes, and fits all levels again: those of the processes, of
+    white noise and of the walk. Processes without information are dropped twice: after the first
+    steps, so that the remaining steps are faster, and at the end. The levels are not fitted again
+    after the end, because a process without information hardly changes the loss.
     """
     problem = workspace.problem
     tuning = problem.tuning
@@ -386,7 +392,10 @@ def _likeliest(
 
 
 def polish(workspace: Workspace, fit: Fit) -> Fit:
-    """Take steps of X and of systematic errors until X settles, at most ``max_rounds`` times."""
+    """Take steps of X and of systematic errors until all of them settle.
+
+    The number of steps is at most ``max_rounds`` minus 1, because the solution takes one more step.
+    """
     problem = workspace.problem
     for _ in range(problem.tuning.max_rounds - 1):
         if is_settled(workspace, fit):
@@ -396,7 +405,11 @@ def polish(workspace: Workspace, fit: Fit) -> Fit:
 
 
 def _take_step(workspace: Workspace, fit: Fit) -> Fit:
-    """Take one step of all parameters. Remove the expected errors from the poses."""
+    """Take one step of all parameters. Remove the expected errors from the poses.
+
+    The step and the errors are those of the present weights. If the white errors have heavy tails,
+    the returned fit has new weights, which count from the next step on.
+    """
     problem = workspace.problem
     posterior = workspace.posterior(fit)
     if fit.has_heavy_tails and "tails" not in problem.without:

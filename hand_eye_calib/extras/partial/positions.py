@@ -54,7 +54,7 @@ from hand_eye_calib.core.noise.outliers import (
     Outliers,
     bridge_outliers,
     detect_outliers,
-    innovation_chi_squares,
+    leave_one_out_chi_squares,
 )
 from hand_eye_calib.core.noise.stages import sample
 from hand_eye_calib.core.noise.state_space import Posterior, StateSpace
@@ -383,7 +383,7 @@ class _State:
 
         Jumps are large steps of the walk. Outliers are single wrong positions.
         """
-        of_walk, of_white = innovation_chi_squares(posterior, self.left_out)
+        of_walk, of_white = leave_one_out_chi_squares(posterior, self.left_out)
         tuning = self.tuning
         outliers = detect_outliers(self.outliers, of_walk, of_white, tuning)
         jump_factors = np.maximum(
