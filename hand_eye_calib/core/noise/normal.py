@@ -324,9 +324,11 @@ class NormalEquations:
     def _log_unseen_scale(self) -> FloatArray:
         """Return (...) log det(N' N), the effect of the scale on directions without information.
 
-        The scaled information S I S has ones on its diagonal, so that S depends on the levels. Let
-        N be the vectors S v of directions v without information. Then ``pdet(I) = pdet(S I S) /
-        det(S)^2 det(N' N)``, with the pseudo-determinants pdet.
+        The pseudo-determinant pdet is the product of all nonzero eigenvalues. It is computed for
+        the scaled information S I S, with the diagonal matrix S of the scales, and needed for I.
+        Let Q be an orthonormal basis of the null space of S I S. Then the columns of N = S Q are a
+        basis of the null space of I, and ``pdet(I) = pdet(S I S) det(N' N) / det(S)^2``. The last
+        factors depend on the noise levels, because S makes the diagonal of S I S equal to 1.
         """
         is_unseen = ~self._is_observed
         both_unseen = is_unseen[..., :, None] & is_unseen[..., None, :]

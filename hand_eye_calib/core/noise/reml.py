@@ -84,7 +84,8 @@ def fit(
     Posterior
         Posterior at the levels with the smallest loss.
     (m, m) array
-        Average information on the levels before the last step.
+        Average information on the levels, without the prior. It belongs to the returned levels if
+        the search ended before a step. Otherwise it belongs to the levels before the last step.
 
     Raises
     ------
@@ -160,10 +161,15 @@ def _newton_step(
 def derivatives(posterior: Posterior) -> tuple[FloatArray, FloatArray]:
     """Return the gradient (m,) of the loss and the average information (m, m) of the levels.
 
-    Let S be the prior covariance of the white errors v, and E[v v'] their posterior second moments.
-    The derivative with respect to the level of a basis of S is ``1/2 exp(level) tr(D basis)``, with
-    ``D = S^-1 - S^-1 E[v v'] S^-1`` summed over all poses. The derivative with respect to a level
-    of the walk has the same form.
+    By Fisher's identity, the gradient is the expected gradient of the joint negative log density of
+    states and walk, at the posterior of this model. The posterior itself is not differentiated. So
+    each error contributes the derivative of ``1/2 (tr(S^-1 E) + log|S|)`` with its prior covariance
+    S and its posterior second moments E, which count as constant. E contains the uncertainty of
+    beta.
+
+    For the white errors v of a pose, S is a sum of bases. The derivative with respect to the level
+    of a basis is ``1/2 exp(level) tr(D basis)`` with ``D = S^-1 - S^-1 E[v v'] S^-1``, summed over
+    all poses. The derivative with respect to a level of the walk has the same form.
     """
     states, walk = posterior.smoothed()
     white_D = _white_difference(posterior, states[:, :WHITE])
@@ -211,9 +217,9 @@ def _group_gradient(
 ) -> FloatArray:
     """Return the derivatives (2,) of the loss with respect to the two levels of a group.
 
-    The levels are the log variance and the log time constant. The loss depends on them through
+    The levels are the log variance and the log time constant. The result is the derivative of
     ``1/2 (tr(Pi E[g g']) - log|Pi|)``, summed over the processes g of the group. Pi is their prior
-    precision, E[g g'] are their posterior second moments.
+    precision. Their posterior second moments E[g g'] count as constant, see :func:`derivatives`.
     """
     covariance, below = posterior.factor.selected_inverse
     values = states[:, group.states]
@@ -264,7 +270,8 @@ def _working_columns(
     space = posterior.space
     variances = np.exp(posterior.levels)
     n_white = len(space.white_bases)
-    # Levels of white errors and of processes: f_k = U (d Pi^-1 / d theta_k) Pi x.
+    # Levels of white errors and of processes: f_k = U (d Pi^-1 / d theta_k) Pi x. For white errors
+    # with the weight z, Pi is z S^-1 and d Pi^-1 is d S / z, so that the weights cancel.
     moved = np.zeros((*states.shape, len(variances)))
     forces = (posterior.white_precision @ states[:, :WHITE, None])[:, :, 0]
     forces[space.weights == 0.0] = 0.0

@@ -7,6 +7,9 @@ white error v_i and of all processes g_ik, with ``phi_ik = exp(-dt_i / tau_k)``.
 
     H1_i = [I, M_{i+1}],      H0_i = Ad(B_i^-1) [I, M_i]
 
+In terms of a Kalman filter, w is the noise of the measurement ``e + J beta``: no state contains the
+walk. The white error v and the noise q of the processes are the process noise.
+
 A process that is an error of the path (a drifting scale or direction) acts on the increment itself.
 Its columns are 0 in H1_i, and minus the derivative of e_i in H0_i.
 
@@ -265,7 +268,7 @@ class Posterior:
         self.space = space
         self.levels = levels
         n_white = len(space.white_bases)
-        is_free = space.weights == 0.0
+        is_outlier = space.weights == 0.0
         self.white_precision, self._white_log_determinants = (
             space.white_precision(levels)
         )
@@ -273,7 +276,7 @@ class Posterior:
             space.weights[:, None, None] * self.white_precision
         )
         # The identity instead of zeros keeps Pi invertible. Its log determinant is zero.
-        self._white_precisions[is_free] = np.eye(WHITE)
+        self._white_precisions[is_outlier] = np.eye(WHITE)
         self.walk_covariance = total_covariance(
             levels[n_white:], space.walk_bases
         )
@@ -341,7 +344,7 @@ class Posterior:
 
     @property
     def whitened(self) -> FloatArray:
-        """Y (N, d, p + 1) of Z = [J e]."""
+        """Y (N, d, p + 1) of Z = [J e]. Its blocks are in order of elimination, not of poses."""
         return self._whitened_and_products[0]
 
     @property
@@ -407,7 +410,11 @@ class Posterior:
     def forward_half(
         self, columns: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) for columns Z (n, 6, k)."""
+        """Return W Z (n, 6, k) and Y = L^-1 U' W Z (N, d, k) for columns Z (n, 6, k).
+
+        The blocks of Y are in order of elimination, see :class:`Factor`. They do not belong to
+        poses.
+        """
         weighted = self._walk_precisions @ columns
         return weighted, self.factor.whiten(
             self.space.apply_u_transposed(weighted)
@@ -459,9 +466,12 @@ class Posterior:
         increments of a block would overestimate the error: it would cut the trajectory, although
         the white noise of the poses transports most information across the gap.
 
-        Each block becomes a quadratic form of the states at both of its ends and of the columns,
-        after elimination of the states between. The forms are added in order of time. Each
-        contribution contains an equal share of the prior of the parameters.
+        The sum of the contributions of all blocks until an instant is ``[J e]' V^-1 [J e]`` of the
+        data until this instant. A contribution is the increase of this sum during a block. The sum
+        needs only the data as a quadratic form of the present state and of the columns [J e]: its
+        minimum over the state is the sum. Each block extends this form by its own form between the
+        states at both of its ends. Each contribution contains an equal share of the prior of the
+        parameters.
 
         Returns
         -------
@@ -471,8 +481,10 @@ class Posterior:
         n, _, n_columns = self.space.columns.shape
         n_states = self.space.h0.shape[2]
         ends = np.linspace(0, n, min(n_blocks, n) + 1).astype(int).tolist()
-        # Quadratic form of the state at the end of the last block, and of the columns.
+        # All data until the end of the last block, as a quadratic form of the state at this end and
+        # of the columns.
         history = np.zeros((n_states + n_columns, n_states + n_columns))
+        # Sums until the end of each block.
         totals = [np.zeros((n_columns, n_columns))]
         for start, end in pairwise(ends):
             form = self._form_between(start, end)
