@@ -16,9 +16,11 @@ Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
 - g_ik: time-correlated errors, which are first-order Gauss-Markov processes; q_ik: their white
   driving noise. M_ik is the matrix from process k to c_i.
 - d_i: errors of the path, a drifting scale and direction, which are processes like g_ik; D_i is the
-  derivative of e_i with respect to them.
+  derivative of e_i with respect to them. A path that is too long by d_i changes e_i like a scale
+  of d_i in beta, so D_i and J_i have the same column for both. The scale in beta is on the left
+  side because it is the correction: -d_i if d_i is constant.
 - w_i (6,): step of a random walk, the drift of odometry. Its variance grows with time, not with the
-  length of the path.
+  length of the path. w is white, and no state contains the walk itself.
 - x_i (d,): state of pose i, which is v_i followed by all processes.
 
 v, g and w are Gaussian. Their variances and the time constants of g are unknown: a *level* is the
@@ -34,7 +36,8 @@ Jumps, outlier poses and the choice of processes and systematic errors are decid
 parts, in the order of the stages.
 
 A process g_ik is one scalar. The one or three processes of one error share variance and time
-constant, and form a *group*. The names of the groups, such as "body", are also called processes.
+constant, and form a *group*. The noise model names a group by its kind and part, for example
+``("body", "translation")``, and calls the whole group a process.
 
 Limits: the linearisation is of first order, the noise levels are constant in time, and about 30
 poses are needed. Method "auto" uses DNLO instead if X does not settle, or if the rotation noise of

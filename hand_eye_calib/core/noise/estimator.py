@@ -102,7 +102,8 @@ class ModelSolution:
         Contributions of blocks of time to the normal equations, see
         :func:`~hand_eye_calib.core.noise.state_space.Posterior.part_products`.
     objective : float
-        Negative log likelihood.
+        Negative log likelihood, without constants, at the estimated parameters and their prior. The
+        restricted likelihood of the levels marginalises the parameters; this likelihood does not.
     converged : bool
         Whether X and all parameters have settled. If not, the method "auto" uses DNLO.
     """

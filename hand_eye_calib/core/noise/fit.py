@@ -170,7 +170,8 @@ class Fit:
         Poses for linearisation: the errors estimated so far were removed, and outlier poses were
         replaced by :func:`~hand_eye_calib.core.noise.outliers.bridge_outliers`.
     error : (N, 6) array
-        Errors c that were removed from the poses.
+        Errors c that were removed from the poses. The walk and the errors of the path are not part
+        of c and were not removed.
     course : Course
         Smoothed motion of the child.
     T : (4, 4) array
@@ -180,7 +181,8 @@ class Fit:
         Levels of the model: log variances and log time constants.
     outliers : Outliers
     weights : (N,) array
-        Weights of the white errors; 1 unless white errors have heavy tails.
+        Weights of the white errors; 1 unless white errors have heavy tails. Outlier poses have
+        weights here, too; only in the state space their weight is 0.
     sigmas : (8,) array
         Prior standard deviations of systematic errors.
     has_heavy_tails : bool

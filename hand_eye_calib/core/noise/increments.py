@@ -57,7 +57,8 @@ PATH_PARTS = ("scale", "direction")
 # Largest number of increments whose first residuals are computed at once. It limits the memory.
 _BATCH = 10_000
 
-# Lower bound of the variance (m^2) of a step about its neighbours. A smaller variance is rounding.
+# Lower bound of the median square (m^2) of the differences between steps and their neighbours. A
+# smaller value is rounding.
 _ROUNDING_M2 = 1e-18
 
 
@@ -176,15 +177,15 @@ def _smooth_steps(
 ) -> FloatArray:
     """Move each step i (n, 3) towards the step with the mean velocity of steps i - 2, i + 2.
 
-    Only a share of the difference between the step and this mean is kept: the share of its median
-    square that exceeds the noise variance.
+    Only a share of the difference between the step and this mean is kept. The share is
+    ``1 - noise_m2 / m``, at least 0, with the median square m of all differences.
     """
     velocities = steps / intervals_s[:, None]
     padded = np.pad(velocities, ((2, 2), (0, 0)), mode="edge")
     smooth = 0.5 * (padded[:-4] + padded[4:]) * intervals_s[:, None]
     differences = steps - smooth
-    variance = max(median(differences**2), _ROUNDING_M2)
-    share = max(1.0 - noise_m2 / variance, 0.0)
+    median_square = max(median(differences**2), _ROUNDING_M2)
+    share = max(1.0 - noise_m2 / median_square, 0.0)
     return smooth + share * differences
 
 

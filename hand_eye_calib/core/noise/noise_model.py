@@ -251,16 +251,20 @@ class NoiseModel:
         return transposed(np.linalg.solve(S_p + S_c, S_p))
 
     def prior(self, levels: FloatArray) -> Prior:
-        """Return the prior of the levels for a search that starts at ``levels`` (m,)."""
+        """Return the prior of the levels for a search that starts at ``levels`` (m,).
+
+        Only the jitter and the time constants have a prior density. The lower bounds of white noise
+        and walk depend on the start.
+        """
         tuning = self.tuning
-        total = increment_levels(levels)
+        smallest_of_parts = increment_levels(levels) + _MIN_LOG_SHARE
         shortest, longest = self._log_tau_bounds
         mean = levels.copy()
         precision = np.zeros(len(levels))
         lower = np.full(len(levels), np.log(MIN_VARIANCE))
         upper = np.full(len(levels), np.inf)
-        lower[WHITES] = np.maximum(lower[WHITES], total + _MIN_LOG_SHARE)
-        lower[WALKS] = np.maximum(lower[WALKS], total + _MIN_LOG_SHARE)
+        lower[WHITES] = np.maximum(lower[WHITES], smallest_of_parts)
+        lower[WALKS] = np.maximum(lower[WALKS], smallest_of_parts)
         mean[JITTER] = tuning.jitter
         # The prior standard deviation of the log variance is 4.5: the jitter may differ by a factor
         # of 10.
@@ -386,9 +390,9 @@ def rough_levels(
     variances = np.zeros(2)
     if len(squares):
         variances = squares.mean(axis=(0, 2))
-    total = np.log(np.maximum(variances, 100 * MIN_VARIANCE))
+    of_increment = np.log(np.maximum(variances, 100 * MIN_VARIANCE))
     levels = np.full(N_FAST, jitter)
     # The white noise of an increment is that of its two poses.
-    levels[WHITES] = total + np.log(0.25)
-    levels[WALKS] = total + np.log(0.5)
+    levels[WHITES] = of_increment + np.log(0.25)
+    levels[WALKS] = of_increment + np.log(0.5)
     return levels

@@ -76,8 +76,9 @@ class Tuning:
 
     # -- Time-correlated errors --
     # Smallest decrease of the loss for which time-correlated errors are added, all of them
-    # together, after white noise and walk were fitted again. Akaike's criterion for two levels
-    # would be 2. The same limit applies to a systematic error: its prior odds are exp(-4).
+    # together. The levels of white noise and walk are fitted again with them, so this decrease
+    # counts, too. Akaike's criterion for two levels would be 2. The same limit applies to a
+    # systematic error: its prior odds are exp(-4).
     least_gain: float = 4.0
     # A process is dropped if the information of the data on its log variance is below this limit,
     # unless the first steps of the search have increased its variance.
