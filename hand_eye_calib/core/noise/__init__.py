@@ -17,8 +17,8 @@ Model, for poses i = 0 ... N - 1 and the increments from pose i to pose i + 1:
   driving noise. M_ik is the matrix from process k to c_i.
 - d_i: errors of the path, a drifting scale and direction, which are processes like g_ik; D_i is the
   derivative of e_i with respect to them. A path that is too long by d_i changes e_i like a scale
-  of d_i in beta, so D_i and J_i have the same column for both. The scale in beta is on the left
-  side because it is the correction: -d_i if d_i is constant.
+  of d_i in beta, so D_i and J_i have the same column for both. The scale in beta is a correction
+  (-d_i for a constant error), and so it is on the left side.
 - w_i (6,): step of a random walk, the drift of odometry. Its variance grows with time, not with the
   length of the path. w is white, and no state contains the walk itself.
 - x_i (d,): state of pose i, which is v_i followed by all processes.
