@@ -1,11 +1,13 @@
 """Derivatives of the residuals of the noise model."""
 
 import numpy as np
+import pytest
 from motions import T_PARENT_CHILD, child_of
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise import increments
+from hand_eye_calib.core.noise.outliers import bridge_outliers
 
 NO_SYSTEMATIC_ERROR = np.zeros(increments.N_SYSTEMATIC)
 
@@ -31,6 +33,35 @@ def inner_residuals(streams, T_parent_child, parameters):
 
 
 SCALE_COLUMN = 6
+
+
+@pytest.mark.parametrize(
+    "outlier_poses", [[0], [0, 1, 2], [30], [30, 31], [59], [0, 1, 30, 58, 59]]
+)
+def test_each_outlier_pose_is_replaced_by_what_the_parent_implies(
+    outlier_poses,
+):
+    times_s = np.arange(60) * 0.1
+    parent = smooth_poses(times_s)
+    child = child_of(parent)
+    spikes = np.isin(np.arange(60), outlier_poses)
+    wrong = child.copy()
+    wrong[spikes] = wrong[spikes] @ se3.exp([5.0, -3.0, 2.0, 0.2, 0.1, 0.4])
+
+    streams = increments.Streams(times_s, parent, wrong)
+    bridged = bridge_outliers(streams, T_PARENT_CHILD, spikes)
+
+    assert_allclose(bridged.Ts_cw_c, child, atol=1e-9)
+    assert_array_equal(bridged.Ts_cw_c[~spikes], child[~spikes])
+    assert_array_equal(streams.Ts_cw_c, wrong)
+
+
+def test_without_a_sound_pose_all_follow_the_first():
+    times_s = np.arange(10) * 0.1
+    parent = smooth_poses(times_s)
+    streams = increments.Streams(times_s, parent, child_of(parent))
+    bridged = bridge_outliers(streams, T_PARENT_CHILD, np.ones(10, dtype=bool))
+    assert_allclose(bridged.Ts_cw_c, streams.Ts_cw_c, atol=1e-9)
 
 
 def test_derivatives_are_the_numerical_ones():

@@ -105,6 +105,22 @@ class TestLeverArm:
             result.T_parent_child[:3, 3], abs=1e-9
         )
 
+    def test_imprecise_positions_at_the_start_do_not_exclude_precise_ones(self):
+        """As of a GNSS receiver before its ambiguities are fixed."""
+        parent, child = recorded(n_poses=600, seed=642)
+        n_imprecise = 80
+        errors_m = np.random.default_rng(642).normal(
+            [4.0, -3.0, 2.0], 0.8, size=(n_imprecise, 3)
+        )
+        measured = child.poses[:, :3, 3].copy()
+        measured[:n_imprecise] += errors_m
+
+        solution = positions.solve(parent.stamps_ns, parent.poses, measured)
+
+        assert solution.imprecise[:n_imprecise].all()
+        assert solution.imprecise.sum() < n_imprecise + 15
+        assert solution.lever_arm == pytest.approx(LEVER_ARM, abs=0.003)
+
     def test_another_clock_is_found_from_the_speeds(self):
         parent, child = recorded(
             poses=wandering_poses(400, seed=4, step_rad=0.02)

@@ -266,18 +266,21 @@ def bridge_outliers(
 
     The state space ignores the error of an outlier pose. But the increments on both sides are
     linearised to first order, which a large error would make invalid. If the parent's pose is
-    wrong, the child's pose is replaced, too: both errors then agree. The first pose of a recording
-    has no previous pose and is not replaced.
+    wrong, the child's pose is replaced, too: both errors then agree. Outlier poses at the start of
+    a recording have no sound pose before them, and are replaced by the next pose, moved back.
     """
     Ts_cw_c = streams.Ts_cw_c.copy()
-    outlier_poses = np.flatnonzero(spikes[1:]) + 1
-    As = (
-        se3.inverse(streams.Ts_pw_p[outlier_poses - 1])
-        @ streams.Ts_pw_p[outlier_poses]
-    )
+    outlier_poses = np.flatnonzero(spikes)
+    first_sound = int(np.argmin(spikes))
+    at_start = outlier_poses[outlier_poses < first_sound][::-1]
+    later = outlier_poses[outlier_poses > first_sound]
+    poses = np.concatenate([at_start, later])
+    neighbours = np.concatenate([at_start + 1, later - 1])
+    As = se3.inverse(streams.Ts_pw_p[neighbours]) @ streams.Ts_pw_p[poses]
     Bs = se3.inverse(T_parent_child) @ As @ T_parent_child
-    for pose, B in zip(outlier_poses, Bs, strict=True):
-        Ts_cw_c[pose] = Ts_cw_c[pose - 1] @ B
+    # A neighbour that is an outlier, too, was replaced before.
+    for pose, neighbour, B in zip(poses, neighbours, Bs, strict=True):
+        Ts_cw_c[pose] = Ts_cw_c[neighbour] @ B
     return Streams(streams.stamps_s, streams.Ts_pw_p, Ts_cw_c)
 
 
