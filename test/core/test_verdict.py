@@ -17,6 +17,7 @@ from hand_eye_calib.core.results.calibration import (
     SolveStatus,
     Verdict,
 )
+from hand_eye_calib.core.results.document import allowance_in_words
 from hand_eye_calib.core.results.records import AxisScatter, Severity
 from hand_eye_calib.core.results.rules import RULES
 from hand_eye_calib.core.results.verdict import shown
@@ -168,6 +169,37 @@ def test_sentences_name_axes_values_and_targets(rule, sentence):
     assert reason.sentence == sentence
 
 
+@pytest.mark.parametrize(
+    ("changes", "cause", "options"),
+    [
+        ({}, "constant odometry errors", ["parent_kind", "child_kind"]),
+        (
+            {"exact_streams": ("parent",)},
+            "constant odometry errors",
+            ["child_kind"],
+        ),
+        ({"reference": "windows"}, "constant odometry errors", ["child_kind"]),
+        (
+            {"exact_streams": ("parent", "child")},
+            "a delay of positions after their orientations",
+            [],
+        ),
+    ],
+)
+def test_an_allowance_has_its_cause_and_the_kinds_that_are_left(
+    changes, cause, options
+):
+    result = good(**CASES["floor"], **changes)
+    (reason,) = result.reasons
+    words = allowance_in_words(result)
+    assert reason.sentence.endswith(f"an allowance for {cause}")
+    assert f"the allowance is for {cause}, which" in words
+    for text in (reason.what_to_do, words):
+        for name in ("parent_kind", "child_kind"):
+            assert (name in text) == (name in options)
+    assert "with target_translation" in reason.what_to_do
+
+
 @pytest.mark.parametrize("more", [{}, {"roll": 0.02}])
 def test_a_longer_recording_is_no_advice_where_constant_errors_exceed_the_target(
     more,
@@ -216,7 +248,7 @@ def test_nothing_against_it_is_use():
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
     assert (
         result.headline
-        == "USE: good to 3 mm and 0.057 deg on every axis (1 sigma)"
+        == "USE: good to 3 mm along and 0.057 deg about x, y and z (1 sigma)"
     )
 
 

@@ -250,6 +250,10 @@ def calibration_of(
         names = ", ".join(by_prior)
         warning = f"{names} of the child sensor: mostly from the prior, not the motion"
         warnings = (warning, *warnings)
+    kinds = {"parent": config.parent_kind, "child": config.child_kind}
+    exact_streams = [
+        stream for stream, kind in kinds.items() if kind == "exact"
+    ]
     defaults = {
         "method": "adaptive",
         "backend": "fast",
@@ -261,6 +265,7 @@ def calibration_of(
         observability_measured=dofs,
         status=_status_of(solution, fused, measured),
         objective=solution.objective,
+        exact_streams=tuple(exact_streams),
         n_poses=len(stamps_ns),
         n_pairs=len(residuals),
         n_inliers=int(residuals.is_inlier.sum()),

@@ -83,6 +83,36 @@ def targets_in_words(axes: Sequence[ReachableAxis]) -> str:
     )
 
 
+def kinds_to_declare(result: Result) -> list[str]:
+    """Return the options, with their values, that would remove a part of the allowance."""
+    # The allowance of a vehicle with wheels is for its sensor alone.
+    streams = (
+        ("child",) if result.reference == "windows" else ("parent", "child")
+    )
+    return [
+        f"{stream}_kind exact"
+        for stream in streams
+        if stream not in result.exact_streams
+    ]
+
+
+def cause_of_allowance(result: Result) -> str:
+    """Return the errors in words that the allowance is for."""
+    if kinds_to_declare(result):
+        of = "" if result.measured == "positions" else "odometry "
+        return f"constant {of}errors"
+    if result.measured == "positions":
+        return "errors of a sensor's reference point"
+    return "a delay of positions after their orientations"
+
+
+def _differ_from_angles(result: Result) -> bool:
+    """Return whether the sigmas about the axes differ from those of the printed angles."""
+    sigmas_rad = (result.sigmas[3:].max(), result.sigmas_rpy.max())
+    about, of_angles = [amount("roll", float(sigma)) for sigma in sigmas_rad]
+    return about != of_angles
+
+
 def what_is_known(result: Result) -> str:
     """Return the accuracy in words: the largest sigmas of translation and of rotation."""
     axes = axes_within_reach(result)
@@ -91,6 +121,11 @@ def what_is_known(result: Result) -> str:
         if totals := [axis.total for axis in axes if axis.name in names]:
             texts.append(amount(names[0], max(totals)))
     if not result.out_of_reach:
+        if _differ_from_angles(result):
+            along, about = texts
+            return (
+                f"good to {along} along and {about} about x, y and z (1 sigma)"
+            )
         return f"good to {listing(texts)} on every axis (1 sigma)"
     within_reach = listing([axis.name for axis in axes])
     hidden = listing(result.out_of_reach)

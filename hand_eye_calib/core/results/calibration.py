@@ -88,8 +88,9 @@ class Calibration(Judged):
         values = ", ".join(
             f"{axis} {number}" for axis, number in numbers.items()
         )
+        notes = "".join(f"\n note: {warning}" for warning in self.warnings)
         return (
-            f"<Calibration: {self.headline}\n {frames}: {values}, "
+            f"<Calibration: {self.headline}{notes}\n {frames}: {values}, "
             f"{self.method} {self.reference}, {self.n_poses} poses>"
         )
 
@@ -153,6 +154,10 @@ class Calibration(Judged):
                 T, self.covariance_allowance
             ),
             observability_measured=tuple(observability),
+            exact_streams=tuple(
+                "child" if stream == "parent" else "parent"
+                for stream in self.exact_streams
+            ),
             parent_frame=self.child_frame,
             child_frame=self.parent_frame,
             parts={

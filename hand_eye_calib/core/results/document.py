@@ -22,6 +22,10 @@ from hand_eye_calib.core.geometry.covariances import (
     sigmas_in_parent,
     sigmas_rpy,
 )
+from hand_eye_calib.core.results.axes import (
+    cause_of_allowance,
+    kinds_to_declare,
+)
 from hand_eye_calib.core.results.parts import ExtraTransform, all_parts, part
 from hand_eye_calib.core.results.reasons import Reason, Verdict
 from hand_eye_calib.core.results.records import (
@@ -450,10 +454,13 @@ def allowance_in_words(result: Result) -> str:
     is_known = np.isfinite(result.sigmas)
     if not result.allowance[is_known].any():
         return ""
-    of = "" if result.measured == "positions" else "odometry "
+    cause = cause_of_allowance(result)
+    options = kinds_to_declare(result)
+    if not options:
+        return f"the allowance is for {cause}, which this recording does not exclude"
     return (
-        f"the allowance is for constant {of}errors, which no recording reveals; a sensor without "
-        "them, such as motion capture, needs parent_kind exact or child_kind exact"
+        f"the allowance is for {cause}, which no recording reveals; a sensor without them, such as "
+        f"motion capture, needs {' or '.join(options)}"
     )
 
 

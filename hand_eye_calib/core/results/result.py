@@ -83,6 +83,8 @@ class Result:
     measured : {"poses", "rotations", "positions"}
         Quantity that both streams measure together. Rotations (and angular rates) do not determine
         the translation. Positions do not determine the rotation. See :attr:`out_of_reach`.
+    exact_streams : tuple of str
+        Streams ("parent", "child") that the user declared exact, without constant errors.
     n_poses, n_pairs, n_inliers : int
         Numbers of synchronised pose pairs, of motion pairs, and of motion pairs that are inliers.
     stamp_ns : int
@@ -150,6 +152,7 @@ class Result:
     contradictions: Mapping[str, float] = field(default_factory=dict)
 
     measured: str = "poses"
+    exact_streams: tuple[str, ...] = ()
     n_poses: int
     n_pairs: int
     n_inliers: int

@@ -6,7 +6,7 @@ has the same table, and a test compares both.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from typing import NamedTuple
 
@@ -23,10 +23,14 @@ from hand_eye_calib.core.results.axes import (
     ReachableAxis,
     amounts_in_words,
     axes_within_reach,
+    cause_of_allowance,
+    kinds_to_declare,
     targets_in_words,
 )
 from hand_eye_calib.core.results.reasons import Ground, Verdict
 from hand_eye_calib.core.results.records import (
+    ROTATIONS,
+    TRANSLATIONS,
     AxisScatter,
     Severity,
     SolveStatus,
@@ -246,7 +250,10 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
     share = result.n_inliers / max(result.n_pairs, 1)
     if share < _fewest_inliers(result):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
-        advice = "look in the report for jumps of an odometry, or poses that are too far apart"
+        advice = (
+            "look in the report for jumps of an odometry; without jumps, the poses of a stream are "
+            "too few per second to interpolate between them"
+        )
         if result.reference == "windows":
             # The outliers of a vehicle are slips.
             text = f"the wheels or the vehicle slip {1 - share:.0%} of the time"
@@ -262,10 +269,20 @@ def _fewest_inliers(result: Result) -> float:
     return FEWEST_INLIERS if uses_reference else FEWEST_OF_MODEL
 
 
-_FLOOR_ADVICE = (
-    "set the target that you need; if a stream has no such errors, such as motion capture, give "
-    "parent_kind exact or child_kind exact"
-)
+def _floor_advice(result: Result, axes: Collection[str]) -> str:
+    """Return the advice if the allowance of some axes exceeds their targets."""
+    targets = []
+    if not {*TRANSLATIONS}.isdisjoint(axes):
+        targets.append("target.translation")
+    if not {*ROTATIONS}.isdisjoint(axes):
+        targets.append("target.rotation")
+    advice = f"set the target that you need with {listing(targets)}"
+    if options := kinds_to_declare(result):
+        advice += (
+            "; if a stream has no such errors, such as motion capture, give "
+            f"{' or '.join(options)}"
+        )
+    return advice
 
 
 def _worse_than_target(result: Result) -> Iterator[Ground]:
@@ -306,10 +323,9 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
         )
         advice.append(f"record {more}")
     if hopeless:
-        alone = (
-            f"constant odometry errors alone leave {amounts_in_words(hopeless)}"
-        )
-        advice.append(f"{alone}: {_FLOOR_ADVICE}")
+        alone = f"{cause_of_allowance(result)} alone leave {amounts_in_words(hopeless)}"
+        to_do = _floor_advice(result, [name for name, _ in hopeless])
+        advice.append(f"{alone}: {to_do}")
     yield Ground(sentence, "; ".join(advice), names)
 
 
@@ -337,16 +353,11 @@ def _floor(result: Result) -> Iterator[Ground]:
         if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above)
         else "Part"
     )
-    errors = (
-        "constant errors"
-        if result.measured == "positions"
-        else "constant odometry errors"
-    )
     sentence = (
         f"{listing(sizes)}; {target_is} {targets_in_words(above)}. "
-        f"{share} of it is an allowance for {errors}"
+        f"{share} of it is an allowance for {cause_of_allowance(result)}"
     )
-    yield Ground(sentence, _FLOOR_ADVICE, names)
+    yield Ground(sentence, _floor_advice(result, names), names)
 
 
 _NEVER = Verdict.DO_NOT_USE

@@ -67,6 +67,7 @@ _OF_NEWEST = (
         "reference",
         "backend",
         "measured",
+        "exact_streams",
         "stamp_ns",
         "parent_frame",
         "child_frame",
