@@ -71,6 +71,13 @@ REPAIRED = {
     ),
 }
 
+
+def one_orientation(Ts):
+    return se3.from_rotation_translation(
+        np.tile(Ts[0, :3, :3], (len(Ts), 1, 1)), Ts[:, :3, 3]
+    )
+
+
 # Mistakes that are refused, and the code of the finding.
 REFUSED = {
     "shifted by one": (lambda Ts: Ts[1:], lambda Ts: Ts[:-1], "rows"),
@@ -85,6 +92,8 @@ REFUSED = {
         "rows",
     ),
     "angles as rotation vectors": (angles_as_vectors, same, "angles"),
+    "robot with one orientation": (one_orientation, same, "no_turning"),
+    "target with one orientation": (same, one_orientation, "no_turning"),
     "robot that never moved": (never_moved, same, "frozen"),
     "poses that were stored too early": (stale, same, "frozen"),
     "y of the target flipped": (same, flipped, "axes"),

@@ -38,6 +38,7 @@ from hand_eye_calib.extras.stops.rotation_checks import (
     check_angles,
     check_frozen,
     check_rows,
+    check_turning,
 )
 from hand_eye_calib.extras.stops.rough_fit import (
     Mistakes,
@@ -160,7 +161,9 @@ def _check_rotations(poses: StopPoses) -> list[Finding]:
     Rows are not checked if one side is frozen throughout. Angles are checked only without other
     findings.
     """
-    findings = [*check_frozen(poses)]
+    findings = [*check_frozen(poses)] or [*check_turning(poses)]
+    if any(issue.code == "no_turning" for issue in findings):
+        return findings
     if all(issue.evidence["share"] < 1.0 for issue in findings):
         findings += check_rows(poses)
     return findings or [*check_angles(poses)]

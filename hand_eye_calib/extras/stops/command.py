@@ -19,8 +19,11 @@ from hand_eye_calib.core.base.option import Options, did_you_mean
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.registry import TARGET_IMAGES
 from hand_eye_calib.core.base.text import shown_value
+from hand_eye_calib.core.checks.findings import finding
+from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.core.geometry.trajectory import Trajectory
-from hand_eye_calib.core.results.calibration import Calibration
+from hand_eye_calib.core.results.calibration import Calibration, Verdict
+from hand_eye_calib.core.results.records import gravest_first
 from hand_eye_calib.extras.stops.calibrate import (
     calibrate_arm,
     calibrate_hand_and_camera,
@@ -44,6 +47,17 @@ SolvedInput: TypeAlias = tuple[
     Calibration, Document, Sequence[Callable[[Calibration], list[Any]]]
 ]
 
+
+# Words in the names of files with poses of a robot's hand, and of files with poses of a camera or a
+# target.
+_ROBOT_WORDS = {
+    *("robot", "arm", "base", "hand", "gripper", "flange", "ee", "eef"),
+    *("effector", "tool", "tcp"),
+}
+_TARGET_WORDS = {
+    *("target", "board", "marker", "tag", "apriltag", "aruco", "charuco"),
+    *("chessboard", "checkerboard", "pattern", "camera", "cam", "object"),
+}
 
 # Ends of files that contain the poses of robot and camera.
 _OF_BOTH_SIDES = (".yaml", ".yml", ".samples")
@@ -111,9 +125,33 @@ def _from_two_files(
         result = calibrate_hand_and_camera(
             parent.poses, child.poses, config, arguments.setup
         )
+        result = _with_order(result, *map(Path, arguments.paths))
     else:
         result = calibrate_stops(parent.poses, child.poses, config)
     return result, _inputs(arguments, len(parent), len(child)), ()
+
+
+def _with_order(result: Calibration, robot: Path, target: Path) -> Calibration:
+    """Return the result with a note on the order of both files, or a doubt from their names.
+
+    Exchanged files fit equally well, so only their names can contradict the order.
+    """
+    if result.verdict is Verdict.DO_NOT_USE:
+        return result
+    of_robot = words_of(robot.stem)
+    of_target = words_of(target.stem)
+    is_target_first = not of_robot.isdisjoint(
+        _TARGET_WORDS
+    ) and of_robot.isdisjoint(_ROBOT_WORDS)
+    is_robot_second = not of_target.isdisjoint(
+        _ROBOT_WORDS
+    ) and of_target.isdisjoint(_TARGET_WORDS)
+    if is_target_first and is_robot_second:
+        doubt = finding("exchanged_files", robot=str(robot), target=str(target))
+        findings = gravest_first([doubt, *result.findings])
+        return replace(result, findings=findings)
+    order = f"read as robot: {robot.name}; read as target: {target.name}"
+    return replace(result, warnings=(order, *result.warnings))
 
 
 def _from_images(

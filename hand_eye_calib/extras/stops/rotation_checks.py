@@ -12,6 +12,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.stats import median, medians
+from hand_eye_calib.core.checks.agreement import SAME_RAD
 from hand_eye_calib.core.checks.findings import Finding, finding
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.rough_fit import (
@@ -89,6 +90,17 @@ def check_frozen(poses: StopPoses) -> Iterator[Finding]:
         )
         share = 1.0 if is_frozen_throughout else min(share, 0.99)
         yield finding("frozen_stops", stream, share=share)
+
+
+def check_turning(poses: StopPoses) -> Iterator[Finding]:
+    """Yield a finding for a side with one orientation at all stops, if the other side turns."""
+    for stream, other in _BOTH_WAYS:
+        own_rad = angles_between(getattr(poses, stream)[:MAX_COMPARED])
+        others_rad = angles_between(getattr(poses, other)[:MAX_COMPARED])
+        turn_rad = median(above_diagonal(others_rad))
+        if own_rad.max() < SAME_RAD and turn_rad > MIN_TURN_RAD:
+            degrees = float(np.degrees(turn_rad))
+            yield finding("only_one_turns_at_stops", stream, degrees=degrees)
 
 
 def check_rows(poses: StopPoses) -> Iterator[Finding]:

@@ -11,6 +11,20 @@ WORDS = {
         "a pose that was stored before it was updated",
         code="frozen",
     ),
+    "only_one_turns_at_stops": FindingWords(
+        "the {stream}'s orientation is the same at all stops, while the other side turns by "
+        "{degrees:.0f} deg in the median",
+        "write the orientations of that side, too, and check the names of their columns",
+        code="no_turning",
+    ),
+    "exchanged_files": FindingWords(
+        "read as robot: {robot}; read as target: {target}; their names suggest the reverse, and "
+        "exchanged files fit equally well",
+        "give the poses of the hand first: hand_eye_calib arm {target} {robot}; if the order is "
+        "right, rename the files",
+        severity=Severity.WARNING,
+        code="exchanged",
+    ),
     "rows": FindingWords(
         "the rows of both sides do not belong together: they agree {text}",
         "pair each pose with the one of the same stop",
