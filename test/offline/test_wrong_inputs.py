@@ -36,6 +36,8 @@ TABLE = """
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
 1 | calibrate lidar.tum nohead.csv | name the 4 with --child-columns
+1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set --parent-times
+1 | calibrate lidar.tum camera.tum few0.tum | few0 (child) with lidar (parent): 10 synchronised
 1 | calibrate commas.csv camera.tum | names 4 columns, but the rows have 8 cells; their numbers seem
 1 | calibrate commas.txt camera.tum | with decimal points, or with ; between cells
 1 | calibrate float32.tum camera.tum | are the same (numbers of 32 bits have steps of 128 s here)
@@ -307,6 +309,7 @@ def write_poses(folder):
     poses = {
         "short": rows[:, :7],
         "few": rows[:4],
+        "few0": np.c_[np.arange(30), rows[:30, 1:]],
         "quat2": double,
         "zeroq": no_rotation,
         "nan": no_numbers,
@@ -324,6 +327,12 @@ def write_poses(folder):
     write_angles(folder / "degrees.csv", rows, angles)
     angles[:, 1:] = [12.0, 0.0]
     write_angles(folder / "tilt.csv", rows, angles)
+    header = "Uhr,Rest,x,y,z,qx,qy,qz,qw"
+    # The file times.txt is not beside this file.
+    path = folder / "apart" / "clock.csv"
+    path.parent.mkdir()
+    table = np.c_[rows[:, 0] - rows[0, 0], rows]
+    np.savetxt(path, table, "%.9f", ",", header=header, comments="")
     write_times(folder, rows)
     text = (folder / "lidar.tum").read_text()
     (folder / "cells.tum").write_text(text.replace("1", "abc", 1))
@@ -383,6 +392,17 @@ def test_a_wrong_input_is_answered_in_one_line(
     assert len(lines) == 1
     assert lines[0].startswith("hand_eye_calib: error: ")
     assert message in lines[0]
+
+
+def test_a_write_protected_folder_is_refused_before_the_solve(
+    run, inputs, monkeypatch
+):
+    monkeypatch.chdir(inputs)
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    files = ("lidar.tum", "camera.tum")
+    code, out, err = run("calibrate", *files, "--out", "folder/new")
+    assert (code, out) == (2, "")
+    assert "argument --out: folder is write-protected; choose another" in err
 
 
 def test_there_are_sixty_wrong_inputs_or_more():

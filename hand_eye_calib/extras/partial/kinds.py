@@ -198,6 +198,9 @@ def check(
         of_solve = _check_solved(snapshot, calibration, is_unrelated)
         if calibration.measured == "rotations":
             findings = _explained(findings, by=of_solve)
+        elif is_unrelated:
+            # A fault that is found nevertheless is the cause, and comes first.
+            findings = [*of_solve, *findings]
         else:
             findings += of_solve
     if hidden and not any(issue.makes_unusable for issue in findings):

@@ -21,6 +21,7 @@ from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import (
     ConfigError,
     InputError,
+    NotEnoughDataError,
     require_type,
 )
 from hand_eye_calib.core.base.plain import Document, plain
@@ -106,9 +107,16 @@ def calibrated(
         replace(trajectory, sensor_frame=frame_name(name))
         for name, trajectory in trajectories.items()
     ]
-    attempts = [
-        run(complete(whole_snapshot(first, other, options))) for other in others
-    ]
+    attempts = []
+    for other in others:
+        snapshot = complete(whole_snapshot(first, other, options))
+        try:
+            attempts.append(run(snapshot))
+        except NotEnoughDataError as error:
+            raise NotEnoughDataError(
+                f"{other.sensor_frame} (child) with {first.sensor_frame} (parent): {error}; or "
+                "leave that sensor out"
+            ) from None
     # Results with the first sensor, and the other trajectories on the clock and in the unit of the
     # first trajectory.
     star = [attempt.calibration for attempt in attempts]

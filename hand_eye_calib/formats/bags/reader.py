@@ -33,6 +33,12 @@ from hand_eye_calib.formats.bags.sources import Reading, Source
 from hand_eye_calib.formats.bags.storage import ALWAYS, MessageKind, Span
 from hand_eye_calib.formats.transforms import TfSource, TfStream
 
+# Packages whose messages contain no pose, except those types that are read.
+_WITHOUT_POSES = (
+    *("sensor_msgs/", "std_msgs/", "visualization_msgs/", "diagnostic_msgs/"),
+    *("rcl_interfaces/", "rosgraph_msgs/", "shape_msgs/"),
+)
+
 
 class PoseBag:
     """Read one bag, or several bags of one recording (context manager).
@@ -240,6 +246,11 @@ class PoseBag:
             )
         elif type_ in messages.IMAGE_TYPES:
             hint = f"name the target in the images, {topic}?charuco:5x7:0.04:0.03, or set --target"
+        elif type_.startswith(_WITHOUT_POSES):
+            hint = (
+                "its messages contain no pose: run the odometry or SLAM of this sensor, "
+                "and give the topic of its poses"
+            )
         raise InputError(
             f"topic {topic} of {self} has type {type_ or 'several types'}, "
             f"which cannot be read; {hint}. {self._listing()}"

@@ -69,7 +69,7 @@ _NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
     "datetime date_time utc utctime utc_time time_utc time_of_day epoch unix_time unixtime "
-    "ros_time rostime",
+    "ros_time rostime zeit zeitstempel aika temps tiempo tempo",
     "date": "date day utc_date date_utc gps_date",
     "week": "week gpsweek gps_week week_number weeknumber weekno week_no gps_week_no weeks wn wnc "
     "gps_wn gwk",

@@ -478,10 +478,12 @@ def _of_angles(
         elif used != expected:
             reason = ", because the motion fits that and not the usual"
         axes = "x forward, y left, z up"
+        undo = ""
         if used == _INVERSE:
             axes = "x, y, z of the world where all angles are 0"
+            undo = "; to read it as that of the sensor in the world, set `invert` orientations"
         table.guess(
-            f"{names[-1]} read as {used}{reason}; axes of the sensor: {axes}"
+            f"{names[-1]} read as {used}{reason}; axes of the sensor: {axes}{undo}"
         )
     return candidates[used]
 

@@ -10,7 +10,8 @@ from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.config import STAMP_UNITS, CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
-from hand_eye_calib.core.base.text import duration
+from hand_eye_calib.core.base.text import duration, shortened
+from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.trajectory_files.dates import (
     DAY_S,
     WEEK_S,
@@ -49,6 +50,16 @@ def _without_stamps(table: Table) -> str:
         remedy = (
             "read them with read_trajectory(poses, times=stamps); stops without stamps are for "
             "calibrate_stops"
+        )
+    used = {*table.at.values()}
+    others = [
+        name for column, name in enumerate(table.names) if column not in used
+    ]
+    if others:
+        listed = shortened(" or ".join(others), LONGEST_NAME)
+        return (
+            f"{table.path}: the poses have no stamps; name their column t (is it {listed}?), or "
+            "set `times`"
         )
     return f"{table.path}: the poses have no stamps; {remedy}"
 

@@ -3,6 +3,7 @@
 Each error contains the command that the user probably wants.
 """
 
+import os
 import re
 import shlex
 from collections.abc import Collection, Sequence
@@ -104,4 +105,11 @@ def directory(text: str) -> Path:
             raise ConfigError(
                 f"{folder} is a file; give a folder, such as drive/"
             )
+    existing = next(
+        (folder for folder in (path, *path.parents) if folder.is_dir()), None
+    )
+    if existing and not os.access(existing, os.W_OK | os.X_OK):
+        raise ConfigError(
+            f"{existing} is write-protected; choose another directory, or change its permissions"
+        )
     return path

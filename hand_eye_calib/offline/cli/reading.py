@@ -265,9 +265,8 @@ def _with_option_of_file(
     """
     for path, stream in zip(paths, streams, strict=True):
         if stream and text.startswith(str(path)):
-            return re.sub(
-                f"`({'|'.join(FILE_OPTIONS)})`", rf"`{stream}_\1`", text
-            )
+            names = "|".join([*FILE_OPTIONS, "invert"])
+            return re.sub(f"`({names})`", rf"`{stream}_\1`", text)
     return text
 
 
