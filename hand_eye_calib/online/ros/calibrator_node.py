@@ -40,7 +40,11 @@ from hand_eye_calib.online.live.log import GOES_ON_S, NodeLog
 from hand_eye_calib.online.live.saving import Saver
 from hand_eye_calib.online.live.session import LiveSession, output_path
 from hand_eye_calib.online.live.state import REPORT_PERIOD_S, NodeState, Outcome
-from hand_eye_calib.online.ros.inputs import TfInput, TopicInput
+from hand_eye_calib.online.ros.inputs import (
+    TfInput,
+    TopicInput,
+    how_to_remap,
+)
 from hand_eye_calib.online.ros.lifecycle import ManagedNode
 from hand_eye_calib.online.ros.outputs import (
     PROGRESS_TOPIC,
@@ -315,6 +319,8 @@ class CalibratorNode(ManagedNode):
                 f"no pose yet on {source.topic}: {source.problem}"
                 for source in silent
             ]
+            if remedy := how_to_remap(self, silent):
+                texts.append(remedy)
             self._log.info("; ".join(texts), GOES_ON_S)
         self._cycle.start_if_due()
 

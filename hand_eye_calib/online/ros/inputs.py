@@ -18,8 +18,9 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from hand_eye_calib.core.base.config import POSE_TYPES, CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError, NoPoseError
 from hand_eye_calib.core.base.registry import LIVE_READINGS
-from hand_eye_calib.core.base.text import counted, listing
+from hand_eye_calib.core.base.text import counted, listing, shortened
 from hand_eye_calib.formats.bags import messages, unpacking
+from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.transforms import PoseFields, TfSource, TfStream
 from hand_eye_calib.online.live.input import PoseInput, with_stamp
 from hand_eye_calib.online.live.log import NodeLog
@@ -69,6 +70,8 @@ class RosInput(PoseInput):
 
     def __init__(self, name: str, topic: str, parts: Parts) -> None:
         super().__init__(name, topic, *parts)
+        #: Argument that names another topic; empty if the topic has a publisher.
+        self.remapping = ""
         # Subscriptions with their callbacks. A callback gets a message, and rclpy's information
         # about it.
         self._subscribed: list[
@@ -143,6 +146,9 @@ class TopicInput(RosInput):
         self.problem = self._wrong_qos(publishers) or counted(
             len(publishers), "publisher"
         )
+        self.remapping = ""
+        if not publishers:
+            self.remapping = f"-r {self._relative_topic}:=TOPIC"
         type_name = self._choose_type(
             {publisher.topic_type for publisher in publishers}
         )
@@ -243,6 +249,29 @@ class TopicInput(RosInput):
             )
             return
         self.accept(stamp_ns, partial(self._read, data))
+
+
+def how_to_remap(node: Node, inputs: Sequence[RosInput]) -> str:
+    """Return how the user names other topics for inputs without a publisher; may be empty.
+
+    The text lists the topics with poses that other nodes publish.
+    """
+    remappings = [source.remapping for source in inputs if source.remapping]
+    if not remappings:
+        return ""
+    own = f"{node.get_fully_qualified_name()}/"
+    names = [
+        name
+        for name, types in node.get_topic_names_and_types()
+        if not name.startswith(own)
+        and not {*types}.isdisjoint(POSE_TYPES)
+        and node.count_publishers(name)
+    ]
+    text = f"to use other topics, start with {' '.join(remappings)}"
+    if names:
+        listed = shortened(listing(sorted(names)), LONGEST_NAME)
+        text = f"{text}; topics with poses: {listed}"
+    return text
 
 
 class TfInput(RosInput):
