@@ -380,6 +380,17 @@ def _corrected(
     return trajectory
 
 
+def options_of_streams(
+    parent: Trajectory, child: Trajectory
+) -> dict[str, float | str]:
+    """Return the options that follow from whole trajectories, unless the user sets them."""
+    return {
+        "max_pairs": min(max(len(parent), len(child), 10), _MAX_PAIRS),
+        "parent_measures": parent.measures,
+        "child_measures": child.measures,
+    }
+
+
 def whole_snapshot(
     parent: Trajectory, child: Trajectory, options: Mapping[str, object]
 ) -> Snapshot:
@@ -391,11 +402,7 @@ def whole_snapshot(
     options : mapping
         Options by their public names. If ``max_pairs`` is not set, up to 100,000 pairs are used.
     """
-    of_streams = {
-        "max_pairs": min(max(len(parent), len(child), 10), _MAX_PAIRS),
-        "parent_measures": parent.measures,
-        "child_measures": child.measures,
-    }
+    of_streams = options_of_streams(parent, child)
     config = CalibratorConfig.from_options(of_streams | dict(options))
     warnings: tuple[str, ...] = ()
     if min(len(parent), len(child)) > config.max_pairs == _MAX_PAIRS:

@@ -25,7 +25,7 @@ from hand_eye_calib.core.base.spelling import (
     spelled_options,
 )
 from hand_eye_calib.core.base.version import version_of
-from hand_eye_calib.core.engine.snapshot import Snapshot
+from hand_eye_calib.core.engine.snapshot import Snapshot, options_of_streams
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.axes import target_of
@@ -440,10 +440,11 @@ def _data(
     """Return the variables of the section "Data and solution" of the template."""
     defaults = CalibratorConfig().to_options()
     options = snapshot.config.to_options() if snapshot else defaults
+    implied = options_of_streams(*snapshot.streams) if snapshot else {}
     changed = [
         (name, value)
         for name, value in options.items()
-        if value != defaults[name]
+        if value not in (defaults[name], implied.get(name))
     ]
     kind = "stops"
     if evidence:
