@@ -259,7 +259,8 @@ WORDS = {
     "scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g} to agree with the "
         "parent's",
-        "multiply the lengths, or find out which of the two measures wrongly",
+        "find out which of the two measures wrongly; have the scale estimated (scale estimate), or "
+        "set it",
     ),
     "one_axis": FindingWords(
         "{axes} cannot be determined from this motion, and will be unknown",

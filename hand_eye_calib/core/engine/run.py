@@ -480,7 +480,10 @@ def _with_offset_doubt(
     doubts = [*doubts]
     if "time_offset" in attempt.options and abs(offset_s) > UNASKED_S:
         large = new_finding(
-            "large_time_offset", "child", **offset_values(offset_s)
+            "large_time_offset",
+            "child",
+            options=ESTIMATED_CLOCK,
+            **offset_values(offset_s),
         )
         if large not in attempt.calibration.findings:
             doubts.append(large)

@@ -317,8 +317,7 @@ def _clock_and_scale_lines(
     if calibration.scale_sigma and (is_far or is_scale_free):
         scale = with_sigma(calibration.scale, calibration.scale_sigma, 4)
         lines += wrapped(
-            f"scale {scale}: applied here; other programs must multiply the lengths of {child} by "
-            "it",
+            f"lengths of {child} times {scale}: applied here; other programs must do the same",
             "",
             "  ",
         )
@@ -360,9 +359,16 @@ def next_steps(
     """Return sentences and commands that improve the result; empty if the verdict is USE."""
     if calibration.verdict is Verdict.USE:
         return []
+    from hand_eye_calib.core.engine.run import options_to_solve
+
     options: dict[str, object] = {}
     for reason in shown(calibration.reasons):
         options |= reason.options
+    # An estimated scale has an uncertainty. The value of a time offset is kept, because its
+    # estimate may fail.
+    for found in calibration.findings:
+        if "scale" in options and "scale" in found.options:
+            options["scale"] = options_to_solve(found)["scale"]
     # A command with a value that the user must still measure would not run.
     options = {
         name: value for name, value in options.items() if value != PLACEHOLDER
