@@ -36,7 +36,7 @@ TABLE = """
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
 1 | calibrate lidar.tum nohead.csv | name the 4 with --child-columns
-1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set --parent-times
+1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set
 1 | calibrate lidar.tum camera.tum few0.tum | few0 (child) with lidar (parent): 10 synchronised
 1 | calibrate commas.csv camera.tum | names 4 columns, but the rows have 8 cells; their numbers seem
 1 | calibrate commas.txt camera.tum | with decimal points, or with ; between cells
