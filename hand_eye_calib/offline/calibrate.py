@@ -28,6 +28,7 @@ from hand_eye_calib.core.engine.cross_check import (
 )
 from hand_eye_calib.core.engine.run import Progress, run
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
+from hand_eye_calib.core.geometry.span import Span
 from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
@@ -73,6 +74,8 @@ def calibrate(
     *,
     parent_topic: str | None = None,
     child_topic: str | None = None,
+    start: float | None = None,
+    end: float | None = None,
     method: MethodName | None = None,
     reference: str | None = None,
     backend: Literal["fast", "ipopt"] | None = None,
@@ -125,6 +128,9 @@ def calibrate(
     parent_topic, child_topic : str, optional
         Topics of a bag, or frames such as "odom:lidar". They may be omitted if only one pair of
         streams is possible.
+    start, end : float, optional
+        Part of the recording to use: seconds after its start, which is the first instant at which
+        both streams have poses. From 1e8 on, a stamp in seconds.
     prior : mapping of str to (float, float) or str, optional
         Value and standard deviation of x, y, z (m), roll, pitch or yaw (rad), such as
         ``{"z": (1.85, 0.02)}``; see :data:`~hand_eye_calib.core.base.text.Prior`.
@@ -161,6 +167,8 @@ def calibrate(
     first, second = _read_both(
         parent, child, {"parent": parent_topic, "child": child_topic}
     )
+    span = Span.of(start, end)
+    first, second = span.cut((first, second), ("the parent", "the child"))
     values |= prior_fields({} if prior is None else prior)
     options = {
         option_name(field): values[field.name]

@@ -25,6 +25,8 @@ from hand_eye_calib.offline.calibrate import prior_fields
 OWN_KEYWORDS = (
     "parent_topic",
     "child_topic",
+    "start",
+    "end",
     "prior",
     "ground",
     "progress",

@@ -34,13 +34,16 @@ _PRIOR_OF_ROTATION = "90deg+/-2deg"
 _FIELDS = CalibratorConfig.by_name()
 # Arguments of extras that appear in messages of the engine, with their values.
 _CHOICES = {"ground": ("auto", "off"), "setup": ("hand", "beside")}
+# Arguments of readers that appear in messages of the engine; their values are any numbers.
+_TIMES = ("start", "end")
 
 # Possible options in a message, with a possible value: a word in backticks; a word with a dot or an
-# underscore, such as max_gap and prior.z; scale, ground and setup before a value. Words in a path,
-# after a dash or in quotes do not count.
+# underscore, such as max_gap and prior.z; scale, ground, setup, start and end before a value. Words
+# in a path, after a dash or in quotes do not count.
 _OPTION_IN_TEXT = re.compile(
     r"(?:`(?P<quoted>[\w.]+)`|(?<![\w./\\='-])(?P<name>[a-z]+\d?(?:[._]+[a-z]+)+|"
-    r"scale(?= (?:none|auto|estimate\b|\d))|ground(?= (?:auto|off)\b)|setup(?= (?:hand|beside)\b)))"
+    r"scale(?= (?:none|auto|estimate\b|\d))|ground(?= (?:auto|off)\b)|setup(?= (?:hand|beside)\b)|"
+    r"(?:start|end)(?= \d)))"
     r"(?![\w/=-]|\.\w)(?: (?P<value>[^\s,;:()]*[^\s,;:().]))?"
 )
 # A prior in metres or radians.
@@ -52,11 +55,12 @@ def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
 
     ``others`` has the names of further options of the interface in messages.
     """
+    names = {*_FIELDS, *_CHOICES, *_TIMES, *others}
 
     def option(match: re.Match[str]) -> str:
         name = match["quoted"] or match["name"]
         value = match["value"]
-        if name not in _FIELDS and name not in _CHOICES and name not in others:
+        if name not in names:
             return match[0]
         if value is None:
             return _name_alone(name, interface)

@@ -1,6 +1,8 @@
 """Checks of one stream's stamps and poses, and of its motion against the other stream."""
 
 import itertools
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -101,6 +103,8 @@ _SLOWEST = 0.01
 
 # Step (s) over which velocities are computed. It is long, so that noise contributes little.
 _STEP_S = 1.0
+# Shortest part (ns) without a fault that is worth a calibration: ten seconds.
+_MIN_SOUND_NS = 10_000_000_000
 # Quantile of speeds and sizes that counts as usual: up to a tenth may be jumps.
 USUAL = 0.9
 
@@ -300,26 +304,60 @@ def check_frozen(parent: Trajectory, child: Trajectory) -> list[Finding]:
 
     Both streams are on one clock.
     """
-    shares = {
-        "parent": frozen_share(parent, child),
-        "child": frozen_share(child, parent),
-    }
-    durations_s = {"parent": parent.duration_s, "child": child.duration_s}
-    findings = (
-        graded(
+    first_ns = max(parent.stamps_ns[0], child.stamps_ns[0])
+    last_ns = min(parent.stamps_ns[-1], child.stamps_ns[-1])
+    findings = []
+    for name, stream, other in (
+        ("parent", parent, child),
+        ("child", child, parent),
+    ):
+        intervals_ns = frozen_intervals(stream, other)
+        if not intervals_ns:
+            continue
+        frozen_s = 1e-9 * sum(until - since for since, until in intervals_ns)
+        share = frozen_s / max(stream.duration_s, 1e-9)
+        found = graded(
             "frozen",
             name,
             share,
             share=share,
-            frozen_s=share * durations_s[name],
+            frozen_s=frozen_s,
+            longest=_longest_between(intervals_ns, first_ns, last_ns),
         )
-        for name, share in shares.items()
-    )
-    return [*filter(None, findings)]
+        if found:
+            findings.append(found)
+    return findings
 
 
-def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
-    """Return the share of the time in which a stream repeats its pose while the other sensor moves.
+def _longest_between(
+    intervals_ns: Sequence[tuple[int, int]], first_ns: int, last_ns: int
+) -> str:
+    """Return the advice to calibrate the longest part of a recording without frozen poses.
+
+    ``intervals_ns`` are the frozen intervals in the order of time. The recording has poses of both
+    streams from ``first_ns`` to ``last_ns``.
+    """
+    starts_ns = [first_ns, *(until for _, until in intervals_ns)]
+    ends_ns = [*(since for since, _ in intervals_ns), last_ns]
+    lengths_ns = np.subtract(ends_ns, starts_ns)
+    longest = int(np.argmax(lengths_ns))
+    if lengths_ns[longest] < _MIN_SOUND_NS:
+        return "record again, because no part of 10 s is"
+    limits = []
+    if longest > 0:
+        # Round inwards, so that the part contains no frozen pose.
+        start_s = math.ceil((starts_ns[longest] - first_ns) * 1e-9)
+        limits.append(f"start {start_s}")
+    if longest < len(intervals_ns):
+        end_s = math.floor((ends_ns[longest] - first_ns) * 1e-9)
+        limits.append(f"end {end_s}")
+    return f"calibrate with {' and '.join(limits)}, the longest part"
+
+
+def frozen_intervals(
+    trajectory: Trajectory, other: Trajectory
+) -> list[tuple[int, int]]:
+    """Return the intervals (ns) in which a stream repeats its pose while the other sensor moves.
 
     Parameters
     ----------
@@ -329,7 +367,7 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
         The stream of the other sensor, on the same clock.
     """
     usual_m_s = usual_speed(other.stamps_ns, se3.translation_of(other.poses))
-    frozen_ns = 0
+    intervals_ns: list[tuple[int, int]] = []
     for from_ns, until_ns in repetitions(trajectory, _MIN_FROZEN_S):
         n_parts = max(1, round((until_ns - from_ns) * 1e-9 / _PART_S))
         edges_ns = np.linspace(from_ns, until_ns, n_parts + 1).astype(np.int64)
@@ -338,8 +376,8 @@ def frozen_share(trajectory: Trajectory, other: Trajectory) -> float:
                 other.stamps_ns <= last_ns
             )
             if _moves(other[is_part], usual_m_s):
-                frozen_ns += last_ns - first_ns
-    return frozen_ns * 1e-9 / max(trajectory.duration_s, 1e-9)
+                intervals_ns.append((first_ns, last_ns))
+    return intervals_ns
 
 
 def _moves(part: Trajectory, usual_m_s: float) -> bool:

@@ -64,7 +64,7 @@ WORDS = {
     "frozen": FindingWords(
         "the {stream} stream repeats the same pose for {frozen_s:.1f} s ({share:.1%} of the time) "
         "while the other sensor moves",
-        "find out why its source stopped, and cut that part out",
+        "find out why its source stopped; {longest} without this fault",
     ),
     "interleaved": FindingWords(
         "{whose} poses alternate between two levels {distance_m:.2g} m apart",
@@ -352,19 +352,20 @@ WORDS = {
     "exchanged": FindingWords(
         "the streams are exchanged about {at_s:.0f} s after the start: each has the motion of the "
         "other sensor from there on",
-        "find out where their names or topics were mixed up, or calibrate the parts before and "
-        "after on their own",
+        "find out where their names or topics were mixed up, or calibrate each part on its own, "
+        "with end {at_s:.0f} and with start {at_s:.0f}",
         "topics that were remapped, or files whose names were mixed up",
     ),
     "parts_turned": FindingWords(
         "two parts of the recording are sound by themselves, and their rotations differ by {size}",
-        "calibrate each part on its own",
+        "calibrate each part on its own, with end {at_s:.0f} and with start {at_s:.0f}",
         "a source that started anew with other axes",
         code="mount_moved",
     ),
     "mount_moved": FindingWords(
         "the extrinsic changes {at_s:.0f} s after the start by {size}",
-        "tighten it and record again, or calibrate the parts before and after on their own",
+        "tighten it and record again, or calibrate each part on its own, with end {at_s:.0f} and "
+        "with start {at_s:.0f}",
         "a mount that came loose or was knocked, or an estimator that started anew",
     ),
 }

@@ -45,6 +45,7 @@ from hand_eye_calib.offline.cli.present import (
     gravest_code,
     wrapped,
 )
+from hand_eye_calib.offline.cli.reading import span_from
 from hand_eye_calib.offline.cli.reporting import REPORT
 
 # Largest number of results on the terminal. rows.csv contains all results.
@@ -182,6 +183,7 @@ def _all_done(
         options=options_from(arguments),
         sources=sources_from(arguments),
         without=tuple(switched_off(vars(arguments))),
+        span=span_from(arguments),
         with_fingerprints=bool(out),
         with_report=bool(out) and not arguments.no_report,
     )

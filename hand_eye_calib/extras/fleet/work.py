@@ -27,6 +27,7 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.python_path import starting_trusted
 from hand_eye_calib.core.base.text import distinct_names
+from hand_eye_calib.core.geometry.span import WHOLE, Span
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.together import row_of_result
 from hand_eye_calib.formats import remote
@@ -63,6 +64,8 @@ class Task:
         Topics or WORLD:SENSOR of "parent" and "child", if the user set them.
     without : tuple of str
         Names of the measurements without motion that are switched off.
+    span : Span
+        Part of the recording to use.
     with_fingerprints, with_report : bool
         Whether to compute hashes of the input files, and to render a report.
     """
@@ -73,6 +76,7 @@ class Task:
     options: Options = field(default_factory=dict)
     sources: dict[str, str] = field(default_factory=dict)
     without: tuple[str, ...] = ()
+    span: Span = WHOLE
     with_fingerprints: bool = False
     with_report: bool = False
 
@@ -278,7 +282,7 @@ def work(task: Task) -> Outcome:
         with remote.local_copies(task.bags) as (paths, restore_urls):
             bags = [*map(Path, paths)]
             recording = read_recording(
-                bags, task.sources, task.options, task.without
+                bags, task.sources, task.options, task.without, task.span
             )
             result = recording.solved(task.with_fingerprints)
             inputs = recording.inputs

@@ -22,7 +22,7 @@ from hand_eye_calib.offline.cli.present import (
     verdict_lines,
     wrapped,
 )
-from hand_eye_calib.offline.cli.reading import read_files
+from hand_eye_calib.offline.cli.reading import read_files, span_from
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
@@ -121,7 +121,9 @@ def _read_topics(arguments: argparse.Namespace) -> _Readings:
     stamps = arguments.stamps or "header"
     with PoseBag(*arguments.paths) as bag:
         trajectories, repairs = read_sources(
-            bag, [(source, "auto", stamps) for source in sources]
+            bag,
+            [(source, "auto", stamps) for source in sources],
+            span_from(arguments),
         )
         inputs: Document = {"bag": str(bag), "topics": topics}
         if arguments.out:

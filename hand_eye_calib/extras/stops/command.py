@@ -258,7 +258,7 @@ def _refuse_ignored(arguments: Namespace) -> None:
         raise ConfigError(
             "--pair-by time has no meaning for stops, which have no stamps; give row"
         )
-    names = ["topics"]
+    names = ["topics", "start", "end"]
     of_streams = ["topic", "fields"]
     if len(arguments.paths) == 1:
         names += [*FILE_OPTIONS, "pair_by"]

@@ -6,10 +6,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
+import numpy as np
+
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.engine.calibrator import Calibrator, Calibrators
+from hand_eye_calib.core.geometry.span import WHOLE, Span
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags.pose_table import PoseTable
 from hand_eye_calib.formats.bags.reader import PoseBag
@@ -57,6 +60,7 @@ def read_recording(
     wanted: Mapping[str, str],
     options: Mapping[str, Any],
     without: Collection[str] = (),
+    span: Span = WHOLE,
 ) -> Recording:
     """Read the recording of a journal, of a bag or of the parts of a bag.
 
@@ -70,11 +74,15 @@ def read_recording(
         Options that the user has set.
     without : collection of str
         Names of the measurements without motion that are switched off.
+    span : Span
+        Part of the recording to use.
 
     Raises
     ------
     SeveralRecordingsError
         If the paths are not parts of one recording. Each journal is a recording.
+    ConfigError
+        If a journal is read with options that apply to bags only.
     """
     journals = [journal for path in paths if (journal := journal_in(path))]
     journal = journals[0] if journals else None
@@ -84,7 +92,7 @@ def read_recording(
         )
     if journal is None:
         recording = _read_bags(
-            paths, wanted, CalibratorConfig.from_options(dict(options))
+            paths, wanted, CalibratorConfig.from_options(dict(options)), span
         )
         with waiting_for("looking for the ground and gravity"):
             recording.snapshot, notes = with_measurements(
@@ -95,6 +103,11 @@ def read_recording(
     if wanted:
         raise ConfigError(
             f"the journal {journal} has two streams; omit the options for topics, frames and stamps"
+        )
+    if span:
+        raise ConfigError(
+            "a journal is used as a whole; for a part, calibrate its files: hand_eye_calib "
+            f"calibrate {journal}/parent.tum {journal}/child.tum, with `start` and `end`"
         )
     return read_journal_of(journal, options)
 
@@ -138,15 +151,19 @@ def stamps_of(wanted: Mapping[str, str]) -> dict[str, str]:
 
 
 def read_sources(
-    bag: PoseBag, measures: Sequence[tuple[Source, str, str]]
+    bag: PoseBag,
+    measures: Sequence[tuple[Source, str, str]],
+    span: Span = WHOLE,
 ) -> tuple[list[Trajectory], list[str]]:
-    """Read the whole trajectories of sources of a bag.
+    """Read the trajectories of sources of a bag.
 
     Parameters
     ----------
     bag : PoseBag
     measures : sequence of (Source, str, str)
         Sources, their quantities, and the stamps to use: "header" or "receive".
+    span : Span
+        Part of the recording to use.
 
     Returns
     -------
@@ -168,11 +185,15 @@ def read_sources(
         trajectories.append(trajectory)
         repairs += notes
     note(*bag.warnings)
-    return trajectories, repairs
+    names = [str(source) for source, _, _ in measures]
+    return span.cut(trajectories, names), repairs
 
 
 def _read_bags(
-    paths: Sequence[Path], wanted: Mapping[str, str], config: CalibratorConfig
+    paths: Sequence[Path],
+    wanted: Mapping[str, str],
+    config: CalibratorConfig,
+    span: Span,
 ) -> Recording:
     """Read the parts of one recording, and feed the poses to an engine."""
     with PoseBag(*paths) as bag:
@@ -191,7 +212,7 @@ def _read_bags(
             measures,
             stamps,
         )
-        _feed(calibrator, poses, sources)
+        _feed(calibrator, _part_of(poses, span, sources), sources)
         for stream, source in sources.items():
             if not calibrator.frame(stream):
                 calibrator.set_frame(stream, str(source))
@@ -200,6 +221,20 @@ def _read_bags(
         return Recording(
             calibrator.snapshot(), inputs, bag.files, tuple(bag.warnings)
         )
+
+
+def _part_of(
+    poses: PoseTable, span: Span, sources: Mapping[str, Source]
+) -> PoseTable:
+    """Return the poses of both streams in a span."""
+    of_streams = [np.flatnonzero(poses.streams == stream) for stream in STREAMS]
+    # A stream without poses is refused later.
+    if not span or not all(map(len, of_streams)):
+        return poses
+    stamps_ns = [poses.stamps_ns[rows] for rows in of_streams]
+    masks = span.rows(stamps_ns, [str(sources[stream]) for stream in STREAMS])
+    kept = [rows[mask] for rows, mask in zip(of_streams, masks, strict=True)]
+    return poses[np.sort(np.concatenate(kept))]
 
 
 def _feed(

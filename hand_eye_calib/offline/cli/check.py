@@ -167,7 +167,8 @@ def _read_streams(
             (sources[stream], measures[stream], stamps[stream])
             for stream in STREAMS
         ]
-        return _Streams(names, *bags.read_sources(bag, readings))
+        span = reading.span_from(arguments)
+        return _Streams(names, *bags.read_sources(bag, readings, span))
 
 
 def _stream_lines(

@@ -85,6 +85,7 @@ STAMPS = ("header", "receive")
 _INPUT_OPTIONS = (*FILE_OPTIONS, "pair_by", "stamps")
 _OPTIONS_OF_READERS = {
     *_INPUT_OPTIONS,
+    *("start", "end"),
     *(f"{stream}_{name}" for stream in STREAMS for name in _INPUT_OPTIONS),
 }
 
@@ -417,6 +418,7 @@ def add_input_arguments(
     for stream in STREAMS:
         same = f"the same for the {stream} only"
         group.add_argument(f"--{stream}-stamps", choices=STAMPS, help=same)
+    _add_times(parser)
     group = parser.add_argument_group(
         "trajectory files",
         "each option also exists as --parent-... and --child-... for one of the two files",
@@ -437,6 +439,20 @@ def add_input_arguments(
         "their order, without stamps; name, by the names of their images"
     )
     group.add_argument("--pair-by", choices=config.PAIR_BY, help=pair_by)
+
+
+def _add_times(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments about the part of the recording that is used."""
+    group = parser.add_argument_group(
+        "part of the recording",
+        "seconds after its start, when all streams have poses; from 1e8 on, a stamp in seconds",
+    )
+    for name, verb in (("start", "before"), ("end", "after")):
+        group.add_argument(
+            f"--{name}",
+            metavar="SECONDS",
+            help=f"ignore poses {verb} this time",
+        )
 
 
 def sources_from(arguments: argparse.Namespace) -> dict[str, str]:

@@ -16,6 +16,7 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.engine.run import run
 from hand_eye_calib.core.engine.snapshot import Snapshot, whole_snapshot
+from hand_eye_calib.core.geometry.span import Span
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
@@ -251,9 +252,30 @@ def read_files(
         for text in reading.guesses:
             text = _with_option_of_file(text, [path], [stream])
             note(text.replace(str(path), path.name))
+    trajectories = [reading.trajectory for reading in readings]
     return FilesRead(
-        [reading.trajectory for reading in readings], repairs, warnings
+        _part_of(trajectories, arguments, paths), repairs, warnings
     )
+
+
+def _part_of(
+    trajectories: list[Trajectory],
+    arguments: Namespace,
+    paths: Sequence[Path | str],
+) -> list[Trajectory]:
+    """Return the part of the trajectories that the user has named; a ConfigError without times."""
+    span = span_from(arguments)
+    if span and arguments.pair_by in ("row", "name"):
+        raise ConfigError(
+            f"`start` and `end` are times, and `pair_by` {arguments.pair_by} uses none: omit "
+            "them, and remove rows from the files instead"
+        )
+    return span.cut(trajectories, [*map(str, paths)])
+
+
+def span_from(arguments: Namespace) -> Span:
+    """Return the part of the recording that the user has named; a ConfigError if it is empty."""
+    return Span.of(arguments.start, arguments.end)
 
 
 def _with_option_of_file(
