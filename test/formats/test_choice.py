@@ -4,6 +4,9 @@ import pytest
 
 from hand_eye_calib.core.base.errors import UnclearStreamsError
 from hand_eye_calib.formats.bags.choice import TopicInfo, choose
+from hand_eye_calib.formats.bags.messages import quantities_of_types
+from hand_eye_calib.formats.bags.roles import remarks_on_wheels
+from hand_eye_calib.offline.cli.calibrate import advice_on_topics
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -181,3 +184,53 @@ def test_a_topic_of_the_same_sensor_is_not_the_other_stream():
     with pytest.raises(UnclearStreamsError) as caught:
         chosen(rows, frames={**frames, "/imu": "imu_link"})
     assert {*caught.value.options.values()} == {"/odom", "/imu"}
+
+
+@pytest.mark.parametrize(
+    ("rows", "advice"),
+    [
+        (
+            [LIDAR, ("/log", "std_msgs/msg/String", 5)],
+            "accept a topic with poses",
+        ),
+        (
+            [("/front/points", CLOUD, 900)],
+            "accept points of lidars, whose odometry is computed",
+        ),
+        (
+            [("/tf", "tf2_msgs/msg/TFMessage", 9)],
+            "accept frames of /tf: odom:lidar",
+        ),
+        (
+            [LIDAR, ("/tf", "tf2_msgs/msg/TFMessage", 9)],
+            "a topic with poses, or frames of /tf: odom:lidar",
+        ),
+        (
+            [("/imu", IMU, 9000)],
+            "no topic has poses: run the odometry or SLAM of",
+        ),
+    ],
+)
+def test_the_list_of_topics_ends_with_what_can_be_a_stream(rows, advice):
+    quantities = quantities_of_types()
+    described = [
+        {"count": count, "quantity": quantities.get(type_, "")}
+        for _, type_, count in rows
+    ]
+    assert advice in advice_on_topics(described)
+
+
+@pytest.mark.parametrize(
+    ("types", "is_noted"),
+    [
+        ({JOINTS: "/joint_states", ODOMETRY: "/odom"}, True),
+        ({JOINTS: "/joint_states", POSE: "/slam"}, False),
+        ({ODOMETRY: "/odom", POSE: "/slam"}, False),
+    ],
+)
+def test_odometry_beside_wheels_is_noted(types, is_noted):
+    remarks = remarks_on_wheels(types)
+    assert [
+        "if /odom is computed from the wheels of /joint_states" in remark
+        for remark in remarks
+    ] == [True] * is_noted

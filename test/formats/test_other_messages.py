@@ -3,6 +3,7 @@
 import json
 import re
 from datetime import UTC, datetime
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from rosbags.typesys import get_types_from_msg
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.formats.bags.reader import PoseBag
+from hand_eye_calib.formats.bags.sources import hint_for_fields
 from hand_eye_calib.formats.transforms import TfSource
 from hand_eye_calib.offline.cli.main import main
 
@@ -336,7 +338,7 @@ def test_fields_of_a_place_are_positions(bag):
         (
             "/px4?x=position.0,y=position.1,z=position.2",
             InputError,
-            "of its fields is a stamp",
+            "no field is the stamp, t: .* receive \\(the message has timestamp, ",
         ),
     ],
 )
@@ -366,3 +368,35 @@ def test_calibrate_takes_fields_and_two_topics(bag, tmp_path, capsys):
         assert {"/twist", "/geo", "/px4", "/array"} <= opened.topics.keys()
     assert main(["calibrate", str(bag), "--child-fields", fields]) == 2
     assert "--child-fields needs --child-topic" in capsys.readouterr().err
+
+
+def test_messages_without_a_stamp_have_the_times_of_the_recorder(bag):
+    source = "/px4?x=position.0,y=position.1,z=position.2"
+    with PoseBag(bag) as opened:
+        run = next(opened.runs(["/px4"]))
+        trajectory, _ = opened.trajectory(source, "auto", "receive")
+    assert len(trajectory) > 100
+    assert trajectory.stamps_ns[:5].tolist() == run.bag_ns[:5].tolist()
+
+
+@pytest.mark.parametrize(
+    ("fields", "hint"),
+    [
+        (
+            {"header": {"stamp": {"sec": 1, "nanosec": 2}}, "x": 1.0},
+            "name its fields, /a?t=header.stamp,x=... (the message has header.stamp and x)",
+        ),
+        (
+            {"x": 1.0, "y": 2.0, "theta": 3.0},
+            "name its fields, /a?x=..., and take the times of the recorder with `stamps` receive, "
+            "because it has no stamp (the message has x, y and theta)",
+        ),
+        (None, "name its fields, /a?t=header.stamp,x=..."),
+    ],
+)
+def test_the_fields_of_an_unknown_message_are_listed(fields, hint):
+    message = json.loads(
+        json.dumps(fields),
+        object_hook=lambda values: SimpleNamespace(**values),
+    )
+    assert hint_for_fields("/a", message) == hint

@@ -388,7 +388,7 @@ def test_what_is_not_there_is_named_with_what_is(refused, new_bag, tmp_path):
         f"{topic} ({ODOMETRY}, 120 messages)"
         for topic in (CHILD_TOPIC, PARENT_TOPIC)
     ]
-    assert ", ".join(topics) in line
+    assert " and ".join(topics) in line
 
 
 def test_a_misspelt_name_is_answered_with_a_similar_one(

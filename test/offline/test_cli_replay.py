@@ -250,7 +250,7 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
         "100",
         "10.0",
         "Hz",
-        "yes",
+        "poses",
         PARENT.sensor_frame,
     ] in rows
     assert [
@@ -259,9 +259,9 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
         "100",
         "10.0",
         "Hz",
-        "yes",
+        "poses",
     ] in rows
-    assert ["/tf_static", TF, "1", "base:lidar"] in rows
+    assert ["/tf_static", TF, "1", "frames", "base:lidar"] in rows
     code, out, err = run(
         tmp_path / "drive", tmp_path / "tf", "--list", "--json"
     )
@@ -273,6 +273,6 @@ def test_list_shows_topics_types_counts_rates_and_frames(run, tmp_path):
         "rate_hz": pytest.approx(10),
         "frames": [PARENT.sensor_frame],
     }
-    measured["measures"] = ""
+    measured |= {"measures": "", "quantity": "poses"}
     named = {"name": "/a", "type": ODOMETRY, "is_usable": True}
     assert document["topics"][0] == measured | named

@@ -163,8 +163,9 @@ class Snapshot:
             )
         if self.parent_frame == self.child_frame:
             raise InputError(
-                f"both streams name {self.parent_frame!r} as their sensor frame, so there is "
-                "nothing to calibrate between; set parent_frame and child_frame"
+                f"both streams name {self.parent_frame!r} as their sensor frame. If they are of "
+                "two sensors, set parent_frame and child_frame; if they are of one, there is "
+                "nothing to calibrate"
             )
 
     @property

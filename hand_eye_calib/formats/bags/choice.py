@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from hand_eye_calib.core.base.errors import UnclearStreamsError
-from hand_eye_calib.core.base.text import listing, shortened
+from hand_eye_calib.core.base.text import counted, listing, shortened
 from hand_eye_calib.core.geometry.frames import words_of
 from hand_eye_calib.formats.bags import messages, roles
 from hand_eye_calib.formats.exports import role_of
@@ -219,7 +219,7 @@ def _unclear(
     if not sensors:
         advice = _advice({topic.type for topic in topics}, len(missing))
     listed = (
-        f"The bag has {_listed(topics)}"
+        f"The bag has {listed_usable(topics)}"
         if topics
         else "The bag has no other topics"
     )
@@ -332,6 +332,23 @@ def _options(missing: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         f"{stream}_topic": name
         for stream, name in zip(missing, chosen, strict=True)
     }
+
+
+def listed_usable(topics: Sequence[TopicInfo]) -> str:
+    """Return the topics that may belong to a stream as text for an error, and how many others are.
+
+    If there are none, all topics are returned.
+    """
+    types = {
+        *messages.MESSAGE_TYPES,
+        *messages.TF_TYPES,
+        *messages.IMAGE_TYPES,
+    }
+    usable = _of_types(topics, types)
+    n_others = len(topics) - len(usable)
+    if not usable or not n_others:
+        return _listed(topics)
+    return f"{_listed(usable)}, and {counted(n_others, 'topic')} of other types"
 
 
 def _listed(topics: Sequence[TopicInfo]) -> str:

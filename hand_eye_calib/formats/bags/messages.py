@@ -291,6 +291,16 @@ FIELD_POSE_TYPES = tuple(
 )
 
 
+def quantities_of_types() -> dict[str, str]:
+    """Return the quantity in the messages of each readable type, for a list of topics."""
+    quantities = {row.name: row.measures[0] for row in _ROWS}
+    return {
+        **quantities,
+        **dict.fromkeys(TF_TYPES, "frames"),
+        POINTS_TYPE: "points",
+    }
+
+
 def measured_as(message_type: str, wanted: str, source: object) -> str:
     """Return the quantity to read from messages of a type.
 

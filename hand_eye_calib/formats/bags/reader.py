@@ -9,7 +9,7 @@ from collections.abc import (
     Mapping,
     Sequence,
 )
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ from hand_eye_calib.core.base.registry import BAG_READINGS
 from hand_eye_calib.core.geometry.frames import FrameTree, checked_pose
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.bags import messages, roles, sources, unpacking
-from hand_eye_calib.formats.bags.choice import TopicInfo, choose
+from hand_eye_calib.formats.bags.choice import TopicInfo, choose, listed_usable
 from hand_eye_calib.formats.bags.folders import losses_of, open_bags
 from hand_eye_calib.formats.bags.messages import Run
 from hand_eye_calib.formats.bags.pose_table import PoseTable
@@ -135,8 +135,8 @@ class PoseBag:
     # ---- topics
 
     def _listing(self) -> str:
-        """Return a sentence with all topics of the bag, for messages."""
-        topics = ", ".join(map(str, self.topics.values()))
+        """Return a sentence with the topics of the bag, for messages."""
+        topics = listed_usable([*self.topics.values()])
         return f"The bag has {topics or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
@@ -236,7 +236,7 @@ class PoseBag:
         type_ = self.type_of(topic)
         if type_ in messages.MESSAGE_TYPES:
             return
-        hint = "name its fields, TOPIC?t=header.stamp,x=..."
+        hint = sources.hint_for_fields(topic, self._first_message(topic))
         if type_ in messages.TF_TYPES:
             hint = "name two of its frames instead, as odom:lidar"
         elif type_ == messages.TWIST_TYPE:
@@ -255,6 +255,14 @@ class PoseBag:
             f"topic {topic} of {self} has type {type_ or 'several types'}, "
             f"which cannot be read; {hint}. {self._listing()}"
         )
+
+    def _first_message(self, topic: str) -> Any:
+        """Return the first message of a topic, decoded; None if this is impossible."""
+        run = next(self.runs([topic]), None)
+        # The definition of the type may be missing.
+        with suppress(InputError):
+            return next(run.decoded()) if run else None
+        return None
 
     def select(
         self,
@@ -287,8 +295,21 @@ class PoseBag:
             raise InputError(
                 f"parent and child topic are both {parent}; name two topics. {self._listing()}"
             )
-        if parent and child:
-            return parent, child
+        if not (parent and child):
+            parent, child = self._completed(parent, child, named, frames or {})
+        topics = [str(source).partition("?")[0] for source in (parent, child)]
+        types = {self.type_of(topic): topic for topic in topics}
+        self._notes += roles.remarks_on_wheels(types)
+        return parent, child
+
+    def _completed(
+        self,
+        parent: Source | None,
+        child: Source | None,
+        named: Sequence[Source],
+        frames: Mapping[str, str],
+    ) -> tuple[Source, Source]:
+        """Return both sources, of which the user has named at most one, see :meth:`select`."""
         missing = [
             name
             for name, source in (("parent", parent), ("child", child))
@@ -299,7 +320,7 @@ class PoseBag:
             return parent, topics[0]
         if child:
             return topics[0], child
-        return self._by_role(topics, frames or {})
+        return self._by_role(topics, frames)
 
     def _by_role(
         self, topics: Sequence[str], frames: Mapping[str, str]

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.geometry.frames import words_of
+from hand_eye_calib.formats.bags import messages
 from hand_eye_calib.formats.exports import role_of
 
 # Words in topic names, from the likeliest parent to the likeliest child. The empty word represents
@@ -23,6 +24,8 @@ _SAME_WORD = 2.0
 _SAME_KIND = 1.0
 # Score if the messages have no frame. A different frame has the score 0.
 _NO_NAME = 0.5
+
+_ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def parent_and_child(
@@ -93,3 +96,18 @@ def _parent_first(topic: str) -> tuple[int, str]:
     if "child" in words:
         return _WORDS.index("child"), topic
     return min(rank for rank, word in enumerate(_WORDS) if word in words), topic
+
+
+def remarks_on_wheels(topics: Mapping[str, str]) -> list[str]:
+    """Return the remark on an odometry that may be computed from the wheels that it is paired with.
+
+    ``topics`` has the topics of both streams by their message types.
+    """
+    wheels = topics.get(messages.JOINTS_TYPE)
+    odometry = topics.get(_ODOMETRY)
+    if not (wheels and odometry):
+        return []
+    return [
+        f"if {odometry} is computed from the wheels of {wheels}, as that of a wheel controller is, "
+        "this result means nothing: record the odometry of another sensor"
+    ]

@@ -11,7 +11,7 @@ wz) are integrated to poses. A target is written ``/camera/image_raw?charuco:5x7
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import fields as fields_of
 from dataclasses import is_dataclass, replace
 from decimal import Decimal
@@ -26,7 +26,12 @@ from hand_eye_calib.core.base.errors import (
     NoPoseError,
     printable,
 )
-from hand_eye_calib.core.base.text import frame_name, listing, without_poses
+from hand_eye_calib.core.base.text import (
+    frame_name,
+    listing,
+    shortened,
+    without_poses,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.frames import are_null
 from hand_eye_calib.formats.bags import messages, unpacking
@@ -44,6 +49,11 @@ Source = str | TfSource
 _JUMP_S = 0.5
 # All stamps of a topic are unusable if this share of them, or more, is 0 or repeated.
 _MOSTLY = 0.5
+
+# Names of fields that are stamps, in small letters.
+_STAMP_NAMES = {"stamp", "time", "timestamp", "timestamp_sample", "t"}
+# Largest number of characters in a list of a message's fields.
+_LONGEST_FIELDS = 300
 
 _NO_POSES = PoseTable.of([], np.empty((0, 7)))
 
@@ -307,17 +317,44 @@ class PathReading(Reading):
         return self._stamped(table[~is_null])
 
 
-def _fields_in_words(message: Any) -> str:
+def fields_in_words(message: Any) -> str:
     """List the fields of a decoded message, in parentheses; empty if they are unknown."""
-    if not is_dataclass(message):
+    paths = [*_paths_of(message, "")]
+    if not paths:
         return ""
-    # Names that begin with an underscore describe the type of the message.
-    names = [
-        field.name
-        for field in fields_of(message)
-        if not field.name.startswith("_")
-    ]
-    return f" (the message has {listing(names)})"
+    return f" (the message has {shortened(listing(paths), _LONGEST_FIELDS)})"
+
+
+def hint_for_fields(topic: str, message: Any) -> str:
+    """Return the advice to name the fields of a topic, with a list of those of a decoded message.
+
+    ``message`` is None if it cannot be decoded.
+    """
+    names = [path.rpartition(".")[2] for path in _paths_of(message, "")]
+    fields = fields_in_words(message)
+    if not names or any(name.lower() in _STAMP_NAMES for name in names):
+        return f"name its fields, {topic}?t=header.stamp,x=...{fields}"
+    return (
+        f"name its fields, {topic}?x=..., and take the times of the recorder with `stamps` "
+        f"receive, because it has no stamp{fields}"
+    )
+
+
+def _paths_of(message: Any, prefix: str) -> Iterator[str]:
+    """Yield the paths of the fields of a decoded message, such as ``pose.position.x``."""
+    if is_dataclass(message):
+        names = [field.name for field in fields_of(message)]
+    else:
+        # A message in JSON.
+        names = [*getattr(message, "__dict__", ())]
+    for name in names:
+        # Names that begin with an underscore describe the type of the message.
+        if name.startswith("_"):
+            continue
+        value = getattr(message, name)
+        inner = [*_paths_of(value, f"{prefix}{name}.")]
+        is_stamp = messages.ns_of(value) is not None
+        yield from [f"{prefix}{name}"] if is_stamp or not inner else inner
 
 
 class FieldReading(Reading):
@@ -352,6 +389,8 @@ class FieldReading(Reading):
         are_twists = set(TWIST) <= set(names)
         self._table = Table(topic, names, "twists" if are_twists else "auto")
         self._bag_ns: list[int] = []
+        # Fields of the newest message in words, for an error.
+        self._listed = ""
         self.measures = "poses" if are_twists else self._table.measures
         if self.measures == "rates":
             raise InputError(
@@ -359,10 +398,11 @@ class FieldReading(Reading):
             )
 
     def take(self, run: messages.Run) -> None:
-        rows = [
-            [self._cell(message, path) for path in self._paths]
-            for message in run.decoded()
-        ]
+        rows = []
+        for message in run.decoded():
+            rows.append([self._cell(message, path) for path in self._paths])
+        if rows and not self._table.stamp_at:
+            self._listed = fields_in_words(message)
         self._table.fill(enumerate(rows, len(self._bag_ns) + 1), list)
         self._bag_ns += run.bag_ns.tolist()
 
@@ -379,7 +419,7 @@ class FieldReading(Reading):
         except (AttributeError, IndexError, TypeError):
             raise InputError(
                 f"{self.name}: a message has no {'.'.join(path)}; name other fields"
-                f"{_fields_in_words(message)}"
+                f"{fields_in_words(message)}"
             ) from None
         stamp_ns = messages.ns_of(value)
         return (
@@ -390,18 +430,24 @@ class FieldReading(Reading):
 
     def table(self) -> PoseTable:
         table = self._table
-        if not table.stamps:
+        if not len(table.rows):
+            raise InputError(f"no messages with a pose on {self.name}")
+        bag_ns = np.asarray(self._bag_ns)[table.rows]
+        if table.stamps:
+            stamps_ns = stamps_in_ns(table, None)
+        elif self.stamps == "receive":
+            stamps_ns = bag_ns
+        else:
             raise InputError(
-                f"no messages on {self.name}, or none of its fields is a stamp, t"
+                f"{self.name}: no field is the stamp, t: name it, such as t=header.stamp, or use "
+                f"the times of the recorder: `{self.stream}_stamps` receive{self._listed}"
             )
-        stamps_ns = stamps_in_ns(table, None)
         self.notes = table.guesses
         self._note_null(table.n_left_out, table.n_rows)
         if table.measures == "twists":
             poses = _integrated(stamps_ns, table.values())
         else:
             poses = np.column_stack(poses_of(table))
-        bag_ns = np.asarray(self._bag_ns)[table.rows]
         return self._stamped(
             PoseTable.of(stamps_ns, poses).recorded(self.stream, bag_ns)
         )

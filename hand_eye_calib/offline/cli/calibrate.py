@@ -68,8 +68,8 @@ examples:
   hand_eye_calib calibrate my_bag --parent-topic /lidar/odometry --child-topic /camera/odometry
   hand_eye_calib calibrate gnss.csv slam.txt --time-offset estimate --prior z=1.85+/-0.02"""
 
-# Format of a row in the table of topics: topic, type, count, rate, poses and frames.
-_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<7}  {}"
+# Format of a row in the table of topics: topic, type, count, rate, measured quantity and frames.
+_ROW = "{:<32} {:<42} {:>8} {:>10}  {:<9}  {}"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -214,6 +214,7 @@ def _run_locally(
                 options.sources_from(arguments),
                 settings,
                 switched_off(vars(arguments)),
+                reading.span_from(arguments),
             )
         except bags.SeveralRecordingsError as several:
             note(
@@ -239,8 +240,8 @@ def _list_topics(
 ) -> int:
     """Print the topics of a bag, and return the exit code.
 
-    Columns include the mean rate over the whole bag, whether the topic has poses, and the frames of
-    the first messages.
+    Columns include the mean rate over the whole bag, the quantity that the topic measures, and the
+    frames of the first messages.
     """
     from hand_eye_calib.formats.bags.reader import PoseBag
     from hand_eye_calib.offline.cli import reading
@@ -270,14 +271,18 @@ def _list_topics(
 
 def _described_topics(bag: "PoseBag") -> list["Document"]:
     """Return a row for each topic of a bag, as plain values."""
-    from hand_eye_calib.formats.bags.messages import MESSAGE_TYPES
+    from hand_eye_calib.formats.bags.messages import (
+        MESSAGE_TYPES,
+        quantities_of_types,
+    )
 
+    quantities = quantities_of_types()
     measured: dict[str, tuple[str, str]] = {}
     for source in BESIDE_MOTION.values():
         measured |= source.topics(bag)
     rows = []
     for topic in bag.topics.values():
-        quantity, frame = measured.get(topic.name, ("", ""))
+        beside_motion, frame = measured.get(topic.name, ("", ""))
         rate_hz = (
             (topic.count - 1) / (bag.duration_s or 1.0)
             if topic.count > 1
@@ -290,7 +295,8 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
                 "frames": bag.edges_on(topic.name)
                 or _sensor_frames(bag, topic.name, frame),
                 "is_usable": topic.type in MESSAGE_TYPES,
-                "measures": quantity,
+                "quantity": quantities.get(topic.type, ""),
+                "measures": beside_motion,
             }
         )
     return rows
@@ -300,7 +306,7 @@ def _table_of_topics(document: "Document") -> list[str]:
     """Return the lines of the table of topics, followed by advice."""
     lines = [f"{document['bag']}, {document['duration_s']:.1f} s"]
     lines.append(
-        _ROW.format("topic", "type", "count", "rate", "poses", "frames")
+        _ROW.format("topic", "type", "count", "rate", "measures", "frames")
     )
     for row in document["topics"]:
         cells = [
@@ -308,17 +314,30 @@ def _table_of_topics(document: "Document") -> list[str]:
             row["type"] or "several types",
             row["count"],
             "" if row["rate_hz"] is None else f"{row['rate_hz']:.1f} Hz",
-            "yes" if row["is_usable"] else row["measures"],
+            row["quantity"],
             " ".join(row["frames"]),
         ]
         lines.append(_ROW.format(*cells).rstrip())
-    advice = "--parent-topic and --child-topic accept a topic with poses"
-    if any("TFMessage" in (row["type"] or "") for row in document["topics"]):
-        advice += ", or frames of /tf: odom:lidar"
-    if not any(row["count"] for row in document["topics"]):
-        advice = "the bag has no messages: record again"
-    lines.append(advice)
+    lines.append(advice_on_topics(document["topics"]))
     return lines
+
+
+def advice_on_topics(rows: "Sequence[Document]") -> str:
+    """Return the advice below the table of topics."""
+    if not any(row["count"] for row in rows):
+        return "the bag has no messages: record again"
+    quantities = {row["quantity"] for row in rows}
+    if "poses" in quantities:
+        advice = "--parent-topic and --child-topic accept a topic with poses"
+    elif quantities & {"frames", "points"}:
+        advice = "no topic has poses; --parent-topic and --child-topic accept"
+        if "points" in quantities:
+            return f"{advice} points of lidars, whose odometry is computed"
+    else:
+        return "no topic has poses: run the odometry or SLAM of both sensors, and record it"
+    if "frames" in quantities:
+        advice += ", or frames of /tf: odom:lidar"
+    return advice.replace("accept, or", "accept")
 
 
 def _sensor_frames(bag: "PoseBag", topic: str, frame: str) -> list[str]:

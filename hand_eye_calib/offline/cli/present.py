@@ -54,6 +54,14 @@ if TYPE_CHECKING:
 # Longest line of the text, in characters.
 _WIDTH = 100
 
+# Reasons why the streams determine neither translation nor rotation.
+_WHY_NOT_ESTIMATED = {
+    listing(
+        TRANSLATIONS
+    ): ": a stream of rotations or rates contains no positions",
+    listing(ROTATIONS): ": a stream of positions contains no orientation",
+}
+
 # Verdicts on an axis that more motion may improve.
 _IMPROVABLE = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
 
@@ -426,7 +434,7 @@ def transform_lines(
     for axis, number in printed_numbers(transform, out_of_reach).items():
         # A row for three axes, such as "x, y, z", has a text instead of a number.
         if "," in axis:
-            yield f"  {axis} are {number}"
+            yield f"  {axis} are {number}{_WHY_NOT_ESTIMATED[axis]}"
         else:
             sigma_parts = f"  ({parts[axis]})" if axis in parts else ""
             yield f"  {axis:<5} {number:>22}{sigma_parts}"
