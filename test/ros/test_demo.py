@@ -117,3 +117,30 @@ def test_player_does_not_wait_for_ever(domain, monkeypatch):
         HandEyeCalibError, match=r"waited 0\.1 s for the node to listen"
     ):
         play(None, TOPICS, 1.0, 0, lambda: None)
+
+
+def test_live_demo_displays_a_session_from_start_to_end_and_saves_it(
+    tmp_path, domain
+):
+    program = (
+        "import sys; from hand_eye_calib.extras.simulation import demo; "
+        "demo.LIVE_SPEED = 20.0; from hand_eye_calib.offline.cli.main import main; "
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    done = run(
+        "-c", program, "demo", "--live", "--out", tmp_path, domain=domain
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"open http://\S+ in a browser", done.stderr)
+    *_, headline, error = done.stdout.splitlines()
+    assert headline.startswith("USE")
+    apart_mm, apart_deg = map(
+        float,
+        re.match(
+            r"Off the simulated truth by ([\d.]+) mm and ([\d.]+) deg; saved in ",
+            error,
+        ).groups(),
+    )
+    assert apart_mm < 1e3 * LARGEST_ERROR_M
+    assert apart_deg < LARGEST_ERROR_DEG
+    assert (tmp_path / "live" / "extrinsic.yaml").exists()

@@ -63,23 +63,12 @@ def play(
     """
     with _player_node() as (node, executor):
         results = [TransformStamped()]
-        publishers = {}
-        for stream, topic in topics.items():
-            publishers[stream] = node.create_publisher(
-                Odometry, topic, _LOSSLESS
-            )
+        publishers = _publishers(node, topics)
         solve = node.create_client(Trigger, "calibrator/solve")
         node.create_subscription(
             TransformStamped, "calibrator/extrinsic", results.append, LATCHED
         )
         wait = partial(_wait, executor, check)
-
-        def are_subscribed() -> bool:
-            """Whether the node has subscribed to all topics."""
-            return all(
-                publisher.get_subscription_count()
-                for publisher in publishers.values()
-            )
 
         def has_all_poses() -> bool:
             """Whether the newest result uses all poses; call ~/solve again if it does not."""
@@ -88,7 +77,7 @@ def play(
                 requests.append(solve.call_async(Trigger.Request()))
             return transform_of(results[-1]).stamp_ns >= until_ns
 
-        wait(are_subscribed, "listen")
+        wait(partial(_are_subscribed, publishers), "listen")
         _publish_in_time(poses, publishers, speed, executor)
         wait(solve.service_is_ready, "serve ~/solve")
         requests = [solve.call_async(Trigger.Request())]
@@ -97,19 +86,57 @@ def play(
     return se3.from_quat_xyzw(result.position, result.quat_xyzw)
 
 
+def play_live(
+    poses: PoseTable,
+    topics: Mapping[str, str],
+    speed: float,
+    check: Callable[[], None],
+    is_wanted: Callable[[], bool],
+) -> None:
+    """Publish poses to the node as long as ``is_wanted()`` is true.
+
+    For the parameters and errors see :func:`play`.
+    """
+    with _player_node() as (node, executor):
+        publishers = _publishers(node, topics)
+        _wait(executor, check, partial(_are_subscribed, publishers), "listen")
+        _publish_in_time(poses, publishers, speed, executor, is_wanted)
+
+
+def _publishers(node: Node, topics: Mapping[str, str]) -> dict[str, Publisher]:
+    """Return a publisher of odometry for each stream."""
+    return {
+        stream: node.create_publisher(Odometry, topic, _LOSSLESS)
+        for stream, topic in topics.items()
+    }
+
+
+def _are_subscribed(publishers: Mapping[str, Publisher]) -> bool:
+    """Whether the node has subscribed to all topics."""
+    return all(
+        publisher.get_subscription_count() for publisher in publishers.values()
+    )
+
+
 def _publish_in_time(
     poses: PoseTable,
     publishers: Mapping[str, Publisher],
     speed: float,
     executor: SingleThreadedExecutor,
+    is_wanted: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Publish each pose at its time of the playback, and spin between the poses."""
+    """Publish each pose at its time of the playback, and spin between the poses.
+
+    The playback ends early once ``is_wanted()`` is false.
+    """
     # Time at which the stamp 0 would be played.
     start_s = time.monotonic() - int(poses.stamps_ns[0]) * 1e-9 / speed
     for row, stamp_ns in enumerate(poses.stamps_ns.tolist()):
         due_s = start_s + stamp_ns * 1e-9 / speed
         while (remaining_s := due_s - time.monotonic()) > 0:
             executor.spin_once(timeout_sec=remaining_s)
+        if not is_wanted():
+            return
         publishers[poses.streams[row]].publish(_odometry(poses, row))
 
 
