@@ -274,6 +274,13 @@ def test_results_that_all_scatter_more_than_stated_accuse_none():
     assert agreement_of(*results_of(0, 12, factor=0.001)).kind == "differ"
 
 
+@pytest.mark.parametrize(("factor", "are_close"), [(1.0, False), (9.0, True)])
+def test_results_closer_than_their_sigmas_are_explained(factor, are_close):
+    agreement = agreement_of(*results_of(1, 8, factor=factor))
+    sentence = agreement.sentence("abcdefgh")
+    assert ("closer than their standard deviations" in sentence) == are_close
+
+
 def test_a_single_result_and_one_that_knows_nothing():
     Ts, covariances = results_of(3, 2)
     agreement = agreement_of(Ts[:1], covariances[:1])

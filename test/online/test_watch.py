@@ -480,7 +480,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     )
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
-    assert "the mount, after ten minutes" in fragment(view)
+    assert "the mount, and what ten minutes of motion detect" in fragment(view)
     assert "precision" not in fragment(view)
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)

@@ -39,6 +39,9 @@ _UNKNOWN_VARIANCE = 1e4
 _ROUNDS = 2
 # Significance level: probability of a false alarm.
 _LEVEL = 0.01
+# Results are closer together than their standard deviations if the probability of a larger
+# chi-square exceeds this.
+_CLOSE = 0.99
 # Grid of the factors of the usual scatter. Results with more scatter are not from one mount.
 _FACTORS = np.geomspace(1 / 16, 16, 9)
 
@@ -106,6 +109,11 @@ class Agreement:
         if self.kind == "single":
             return sentence
         numbers = f"chi-square {self.chi2:.1f}, {self.dof} degrees of freedom, p {self.p_value:.2g}"
+        if self.dof and self.p_value > _CLOSE:
+            numbers += (
+                ": closer than their standard deviations, which contain the usual scatter "
+                "between recordings"
+            )
         return f"{sentence} ({numbers})"
 
     def _moves(self) -> str:

@@ -33,9 +33,7 @@ exit codes: 0 same, 3 cannot tell, 4 moved; 1 bad input, 2 wrong usage"""
 
 
 # Explanation of a column of the table.
-_SEEN_FROM = (
-    "seen from: the smallest change that would be detected in nine of ten cases"
-)
+_DETECTABLE = "detectable: the smallest change that would be detected in nine of ten cases"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     comparison = compare(results, installed, distinct_names(arguments.results))
     lines = [*_lines(comparison, results[0], arguments.installed)]
     lines += wrapped(scatters_in_words(results, installed), "", "  ")
-    lines += wrapped(_SEEN_FROM, "", "  ")
+    lines += wrapped(_DETECTABLE, "", "  ")
     print_result(lines, comparison if arguments.json else None)
     if not arguments.installed:
         note(*_repeated_recordings(arguments.results))
@@ -127,7 +125,7 @@ def _lines(
         if len(comparison.differences) > 1:
             title = f"{title}: {difference.sentence}"
         yield title
-        yield f"  {'':<6}{'difference':>22}{'+/-':>10}{'seen from':>12}"
+        yield f"  {'':<6}{'difference':>22}{'+/-':>10}{'detectable':>12}"
         for axis, row in difference.axes.items():
             size = amount(axis, row.difference)
             sigma = amount(axis, row.sigma)

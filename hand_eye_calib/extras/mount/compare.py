@@ -8,6 +8,7 @@ from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.core.base.text import amount, distinct_names
 from hand_eye_calib.extras.mount.digest import FOLDER, read_digests
 from hand_eye_calib.extras.mount.history import History
+from hand_eye_calib.extras.mount.monitor import TUNING
 from hand_eye_calib.formats.results import save_text
 from hand_eye_calib.offline.cli.options import note, print_result
 from hand_eye_calib.online.live.progress import AXIS_KEYS
@@ -62,7 +63,8 @@ def _no_digests(path: Path) -> str:
     """Return the sentence about a path without digests: the cause, and what writes digests."""
     return (
         f"{path} has none: the node writes them into {FOLDER}/ of its output_directory if monitor "
-        "and installed are set, at the end of a session with enough motion to learn the noise"
+        f"and installed are set, at the end of a session with more than {TUNING.learning_s} s of "
+        "motion; the log of the node states why a shorter session has none"
     )
 
 

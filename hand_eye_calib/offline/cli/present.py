@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
 from hand_eye_calib.core.base.spelling import PLACEHOLDER, Interface
@@ -61,6 +63,9 @@ _WHY_NOT_ESTIMATED = {
     ): ": a stream of rotations or rates contains no positions",
     listing(ROTATIONS): ": a stream of positions contains no orientation",
 }
+
+# Ratio of two standard deviations of which the larger one needs an explanation.
+_CLEARLY_LARGER = 1.2
 
 # Verdicts on an axis that more motion may improve.
 _IMPROVABLE = (DofVerdict.UNOBSERVABLE, DofVerdict.WEAK)
@@ -297,11 +302,41 @@ def _extrinsic_lines(calibration: Calibration, with_details: bool) -> list[str]:
             )
         else:
             lines += compact_lines(transforms[name], out_of_reach)
+            lines += wrapped(_mixed_axes(transforms, name), "  ", "  ")
         if words := angles_in_words(transforms[name], calibration):
             lines += wrapped(words, "  ", "  ")
         if name == "T_parent_child":
             lines += allowance_lines(calibration)
     return lines
+
+
+def _mixed_axes(transforms: "Mapping[str, Notation]", name: str) -> str:
+    """Explain translations of the inverse that contain a part of an unknown axis; empty if none.
+
+    The sensors are tilted against each other, so that an axis of the inverse mixes axes of the
+    extrinsic.
+    """
+    if name != "T_child_parent":
+        return ""
+    sigmas_m = transforms["T_parent_child"].sigma_translation
+    are_known = np.isfinite(sigmas_m)
+    if are_known.all() or not are_known.any():
+        return ""
+    of_inverse_m = transforms[name].sigma_translation
+    limit_m = _CLEARLY_LARGER * float(sigmas_m[are_known].max())
+    mixed = []
+    for axis, sigma_m in zip(TRANSLATIONS, of_inverse_m, strict=True):
+        if limit_m < sigma_m < np.inf:
+            mixed.append(axis)
+    if not mixed:
+        return ""
+    unknown = [
+        axis
+        for axis, is_known in zip(TRANSLATIONS, are_known, strict=True)
+        if not is_known
+    ]
+    verb = "contains" if len(mixed) == 1 else "contain"
+    return f"here {listing(mixed)} {verb} a part of the unknown {listing(unknown)}, by the tilt"
 
 
 def _clock_and_scale_lines(

@@ -54,7 +54,7 @@ def screen(view: View, width: int, footer: str = "") -> RenderableType:
         rows += [_bars(view, width), _dim(view.title), _pose(view)]
     if view.watched:
         rows += [
-            _dim("the mount, after ten minutes of motion"),
+            _dim("the mount, and what ten minutes of motion detect"),
             _lines(view.watched),
         ]
     rows.append(_lines(view.result + view.health))

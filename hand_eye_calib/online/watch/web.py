@@ -346,7 +346,7 @@ def fragment(view: View, files: Sequence[str] = ()) -> str:
         + _section("axes", axes_title, bars)
         + _section(
             "axes",
-            "the mount, after ten minutes of motion",
+            "the mount, and what ten minutes of motion detect",
             _lines(view.watched),
         )
         + '<div class="side">'
