@@ -12,6 +12,7 @@ EXTRAS = (
     "sensors",  # lidar scans, images of a target, files of other programs
     "ground",  # z, roll and pitch of machines on a flat floor
     "clouds",  # clouds of both lidars in the report, merged through the result
+    "viewer",  # a bag of both paths for RViz, Foxglove and Rerun
     "vehicle",  # a sensor in the frame of its vehicle, and the wheels
     "simulation",  # drives with known truth, and the demo
 )

@@ -70,6 +70,7 @@ NEEDING = {
     ),
     "simulation": (["simulate"], "invalid choice: 'simulate'"),
     "stops": (["calibrate", *SAMPLE, "--order", "none"], "unknown '--order'"),
+    "viewer": (["calibrate", *SAMPLE, "--viewer", "bag"], "unknown '--viewer'"),
     "vehicle": (
         ["calibrate", SAMPLE[0], "--on-vehicle"],
         "unknown '--on-vehicle'",

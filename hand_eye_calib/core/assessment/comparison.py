@@ -226,6 +226,17 @@ def with_comparison(
     )
 
 
+def installed_transform(calibration: Calibration) -> FloatArray | None:
+    """Return the installed T_parent_child (4, 4); None if the result has no comparison with it."""
+    comparison = calibration.comparison
+    if comparison is None or not comparison.values:
+        return None
+    values = np.array([comparison.values[axis] for axis in AXES])
+    return se3.from_rotation_translation(
+        se3.rotation_from_rpy(values[3:]), values[:3]
+    )
+
+
 def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     """Test on each axis whether two named extrinsics differ."""
     first_name, before = first

@@ -93,6 +93,22 @@ class BesideMotion(NamedTuple):
     topics: Callable[[Any], dict[str, tuple[str, str]]]
 
 
+class ResultFile(NamedTuple):
+    """File that ``calibrate`` writes on request, in addition to ``--out``.
+
+    Attributes
+    ----------
+    add_arguments : callable
+        ``add_arguments(parser)`` declares the argument with the path, which has the name of the
+        entry.
+    write : callable
+        ``write(path, calibration, snapshot)`` writes the file.
+    """
+
+    add_arguments: Callable[[Any], None]
+    write: Callable[[Any, Any, Any], None]
+
+
 class Measure(NamedTuple):
     """Quantity that a stream may measure.
 
@@ -205,6 +221,9 @@ TARGET_IMAGES: Registry[Callable[[], Any]] = Registry(
 REPORT_PICTURES: Registry[Callable[[Any, Any, str], Any]] = Registry(
     "picture of the report"
 )
+
+#: Files that ``calibrate`` writes for two streams, by the name of their argument.
+RESULT_FILES: Registry[ResultFile] = Registry("file of a result")
 
 #: Functions ``read(path, content, options)`` that read trajectory files of other programs. They
 #: return None for a file that they do not accept.

@@ -242,6 +242,13 @@ class Snapshot:
             pairs = PosePairs.concatenate(kept, pairs)
         return downsample(pairs, self.config.max_pairs)
 
+    def pose_pairs_of(self, calibration: Calibration) -> PosePairs:
+        """Return the pose pairs with the clock offset and the scale of a result."""
+        # The result contains the clock offset, so it is not estimated again.
+        settled = replace(self.config, time_offset=calibration.time_offset_s)
+        pose_pairs = replace(self, config=settled).pose_pairs
+        return pose_pairs.child_scaled(calibration.scale)
+
     def examined(self, calibration: Calibration) -> Calibration:
         """Return a calibration with the examinations of extras, which depend on its sigmas."""
         for examine in RESULT_EXAMINATIONS.values():

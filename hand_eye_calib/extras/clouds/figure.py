@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 
+from hand_eye_calib.core.assessment.comparison import installed_transform
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
@@ -19,7 +20,6 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.clouds.merging import (
     MergedClouds,
     distances_from_surfaces,
-    installed_transform,
     merge,
 )
 from hand_eye_calib.offline.report.style import (

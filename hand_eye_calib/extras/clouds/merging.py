@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
+from hand_eye_calib.core.assessment.comparison import installed_transform
 from hand_eye_calib.core.base.arrays import FloatArray, IntArray
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.results.calibration import Calibration
-from hand_eye_calib.core.results.records import AXES
 from hand_eye_calib.formats.bags.messages import POINTS_TYPE, Run, ns_of
 from hand_eye_calib.formats.bags.points import (
     rows_of_points,
@@ -134,17 +134,6 @@ def merge(calibration: Calibration, snapshot: Snapshot) -> MergedClouds | None:
         after=after,
         is_upright=is_upright,
         turn_rad=float(max(turns)),
-    )
-
-
-def installed_transform(calibration: Calibration) -> FloatArray | None:
-    """Return the installed T_parent_child (4, 4); None if the result has no comparison with it."""
-    comparison = calibration.comparison
-    if comparison is None or not comparison.values:
-        return None
-    values = np.array([comparison.values[axis] for axis in AXES])
-    return se3.from_rotation_translation(
-        se3.rotation_from_rpy(values[3:]), values[:3]
     )
 
 

@@ -15,6 +15,9 @@ from hand_eye_calib.formats.files import writing
 # Trajectory and message type of each topic.
 Streams = Mapping[str, tuple[Trajectory, str]]
 
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_PATH = "nav_msgs/msg/Path"
+
 
 def write_bag(
     path: str | Path, streams: Streams, storage: str = "mcap"
@@ -26,8 +29,10 @@ def write_bag(
     path : str or Path
         Directory of the bag; for rosbag1, the ``.bag`` file. It must not exist.
     streams : mapping of str to (Trajectory, str)
-        Trajectory and message type of each topic: Odometry, which contains the sensor's frame, or
-        PoseStamped. The stamps of the trajectory are header stamps and bag times.
+        Trajectory and message type of each topic: Odometry and TFMessage, which contain the
+        sensor's frame, PoseStamped, or Path, which is one message of all poses. The stamps of the
+        trajectory are header stamps and bag times. Subscribers that join late also receive a
+        topic of one message.
     storage : {"mcap", "sqlite3", "rosbag1"}
 
     Raises
@@ -62,18 +67,47 @@ def write_streams(writer: Any, streams: Streams, storage: str) -> None:
     serialize = typestore.serialize_ros1 if is_ros1 else typestore.serialize_cdr
     rows = []
     for topic, (trajectory, message_type) in streams.items():
-        connection = writer.add_connection(
-            topic, message_type, typestore=typestore
+        messages = list(
+            stamped_messages(typestore.types, trajectory, message_type, is_ros1)
         )
-        for stamp_ns, message in stamped_messages(
-            typestore.types, trajectory, message_type, is_ros1
-        ):
+        options = {}
+        if len(messages) == 1 and not is_ros1:
+            options["offered_qos_profiles"] = [_latched()]
+        connection = writer.add_connection(
+            topic, message_type, typestore=typestore, **options
+        )
+        for stamp_ns, message in messages:
             rows.append((stamp_ns, connection, message))
     rows.sort(key=lambda row: row[0])
     for stamp_ns, connection, message in rows:
         writer.write(
             connection, stamp_ns, serialize(message, connection.msgtype)
         )
+
+
+def _latched() -> Any:
+    """Return the QoS of a topic whose last message is sent to late subscribers, as /tf_static."""
+    from rosbags.interfaces import (
+        Qos,
+        QosDurability,
+        QosHistory,
+        QosLiveliness,
+        QosReliability,
+        QosTime,
+    )
+
+    unlimited = QosTime(2147483647, 4294967295)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL,
+        unlimited,
+        unlimited,
+        QosLiveliness.AUTOMATIC,
+        unlimited,
+        False,
+    )
 
 
 def stamped_messages(
@@ -84,8 +118,19 @@ def stamped_messages(
 ) -> Iterator[tuple[int, Any]]:
     """Iterate over the stamps (ns) and messages of a trajectory.
 
-    ``types`` has the classes of messages in rosbags, by message type.
+    ``types`` has the classes of messages in rosbags, by message type. A Path is one message with
+    the first stamp.
     """
+    if message_type == _PATH:
+        stamped = stamped_messages(
+            types, trajectory, "geometry_msgs/msg/PoseStamped", is_ros1
+        )
+        poses = [message for _, message in stamped]
+        yield (
+            int(trajectory.stamps_ns[0]),
+            types[_PATH](poses[0].header, poses),
+        )
+        return
 
     def make(name: str, *values: Any) -> Any:
         return types[f"geometry_msgs/msg/{name}"](*values)
@@ -105,9 +150,15 @@ def stamped_messages(
             stamp=stamp, frame_id=trajectory.world_frame, **sequence
         )
         x, y, z, *quat_xyzw = rows[number]
-        pose = make(
-            "Pose", make("Point", x, y, z), make("Quaternion", *quat_xyzw)
-        )
+        rotation = make("Quaternion", *quat_xyzw)
+        if message_type == _TRANSFORMS:
+            transform = make("Transform", make("Vector3", x, y, z), rotation)
+            stamped_transform = make(
+                "TransformStamped", header, trajectory.sensor_frame, transform
+            )
+            yield stamp_ns, types[_TRANSFORMS]([stamped_transform])
+            continue
+        pose = make("Pose", make("Point", x, y, z), rotation)
         parts: tuple[Any, ...] = (pose,)
         if message_type == "nav_msgs/msg/Odometry":
             with_covariance = make("PoseWithCovariance", pose, no_covariance)

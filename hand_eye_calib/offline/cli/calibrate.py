@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from hand_eye_calib.core.base.errors import ConfigError, InputError
 from hand_eye_calib.core.base.registry import (
     BESIDE_MOTION,
+    RESULT_FILES,
     ROUTES,
     SEVERAL_RECORDINGS,
 )
@@ -111,6 +112,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         route.add_arguments(parser)
     for source in BESIDE_MOTION.values():
         source.add_arguments(parser)
+    for file in RESULT_FILES.values():
+        file.add_arguments(group)
     _add_installed(parser)
 
 
@@ -191,6 +194,7 @@ def _run_locally(
     if arguments.list:
         return _list_topics(arguments, with_urls)
     if routes:
+        _refuse_result_files(arguments)
         return routes[0].run(arguments, with_urls)
     from hand_eye_calib.offline.cli import reading
     from hand_eye_calib.offline.cli.present import deliver
@@ -220,6 +224,7 @@ def _run_locally(
             note(
                 f"{several.reason}; they give one result, as recordings of one rig"
             )
+            _refuse_result_files(arguments)
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
     calibration = recording.solved(with_fingerprints=bool(arguments.out))
     calibration = dataclasses.replace(
@@ -233,6 +238,15 @@ def _run_locally(
         recording.snapshot,
         bag,
     )
+
+
+def _refuse_result_files(arguments: argparse.Namespace) -> None:
+    """Raise a ConfigError if a file is requested that only two streams have."""
+    for name in RESULT_FILES:
+        if getattr(arguments, name, None):
+            raise ConfigError(
+                f"--{name} applies to one recording of two sensors with poses; omit it"
+            )
 
 
 def _list_topics(

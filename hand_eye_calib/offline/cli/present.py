@@ -11,6 +11,7 @@ import numpy as np
 
 from hand_eye_calib.core.base.errors import ConfigError, printable
 from hand_eye_calib.core.base.plain import Document
+from hand_eye_calib.core.base.registry import RESULT_FILES
 from hand_eye_calib.core.base.spelling import PLACEHOLDER, Interface
 from hand_eye_calib.core.base.text import frame_name, listing, with_sigma
 from hand_eye_calib.core.checks.findings import LIMITS
@@ -125,6 +126,10 @@ def deliver(
             write_report(
                 arguments.out, calibration, snapshot, inputs, pictures=pictures
             )
+    for name, file in RESULT_FILES.items():
+        if path := getattr(arguments, name, None):
+            file.write(path, calibration, snapshot)
+            note(f"wrote {path}")
     return end([calibration])
 
 

@@ -1,6 +1,6 @@
 """Evidence for a result in its report: both paths, motion, and both streams before the solve."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -164,11 +164,7 @@ class Evidence:
 def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
     """Compute the evidence for a result from its poses and options."""
     config = snapshot.config
-    # The result contains the clock offset, so it is not estimated again.
-    settled = replace(config, time_offset=calibration.time_offset_s)
-    pose_pairs = replace(snapshot, config=settled).pose_pairs.child_scaled(
-        calibration.scale
-    )
+    pose_pairs = snapshot.pose_pairs_of(calibration)
     parent_is_positions = config.parent_measures == "positions"
     # Pairs for the excitation, which is computed from the first sensor's orientations.
     oriented = pose_pairs
