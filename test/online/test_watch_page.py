@@ -112,7 +112,7 @@ def browser(tmp_path_factory):
 
 def started_server(port=0, key="word"):
     requests = queue.SimpleQueue()
-    server = WebServer(Shown(), requests.put, ("127.0.0.1", port))
+    server = WebServer(Shown(), requests.put, "127.0.0.1", [port])
     server.key = key
     server.requests = requests
     return server

@@ -53,7 +53,7 @@ def server(monkeypatch, tmp_path):
     board = Board()
     requests = queue.SimpleQueue()
     board.take(state(), time.monotonic())
-    made = WebServer(board, requests.put, ("127.0.0.1", 0))
+    made = WebServer(board, requests.put, "127.0.0.1", [0])
     made.kept = made.key
     made.key = "word"
     made.requests = requests
@@ -178,4 +178,13 @@ def test_the_address_is_drawn_as_a_code(monkeypatch):
 
 def test_a_port_in_use_is_said_in_one_line(server):
     with pytest.raises(ConfigError, match="choose another with --web PORT"):
-        WebServer(Board(), print, ("127.0.0.1", server.server_port))
+        WebServer(Board(), print, "127.0.0.1", [server.server_port])
+
+
+def test_the_next_port_replaces_a_default_port_in_use(server):
+    used = server.server_port
+    other = WebServer(Board(), print, "127.0.0.1", range(used, used + 10))
+    try:
+        assert used < other.server_port < used + 10
+    finally:
+        other.stop()

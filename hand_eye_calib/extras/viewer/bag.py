@@ -17,14 +17,13 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.bags.writer import write_bag
+from hand_eye_calib.offline.report.style import LOOK
 
 _TF = "tf2_msgs/msg/TFMessage"
 _PATH = "nav_msgs/msg/Path"
 
 # Name of the parent's world if its messages have none.
 _WORLD = "world"
-# Largest number of poses of a path.
-_MAX_POSES = 2000
 
 
 def write_viewer_bag(
@@ -101,7 +100,7 @@ def _between_worlds(
 
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
-    """Return at most ``_MAX_POSES`` poses, evenly chosen, with the first and the last."""
-    count = min(len(trajectory), _MAX_POSES)
+    """Return as many poses as a figure has, evenly chosen, with the first and the last."""
+    count = min(len(trajectory), LOOK.max_points)
     rows = np.linspace(0, len(trajectory) - 1, count).round().astype(int)
     return trajectory[rows]

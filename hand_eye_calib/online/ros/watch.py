@@ -9,7 +9,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from io import StringIO
 from typing import TYPE_CHECKING
 
@@ -25,8 +25,10 @@ examples:
   hand_eye_calib watch --node /robot1/calibrator
   hand_eye_calib watch > log.txt           a line for every new headline"""
 
-# Default port of the page: not 8765, which foxglove_bridge uses.
-_PORT = 8775
+# Ports of the page if the user names none; the first free port is used. Not 8765, which
+# foxglove_bridge uses. Ten, for several robots or people on one computer.
+_DEFAULT_PORTS = range(8775, 8785)
+_DEFAULT_ADDRESS = ("", _DEFAULT_PORTS)
 
 # Longest wait (s) for a message. Keys and requests of a browser are processed after it.
 _MAX_WAIT_S = 0.1
@@ -53,12 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Default: the first node that publishes"
     )
     parser.add_argument("--node", metavar="NAME", default="", help=node)
-    web = f"also serve a page for browsers, at port {_PORT} of all addresses by default"
+    web = (
+        "also serve a page for browsers. Default: port "
+        f"{_DEFAULT_PORTS.start} of all addresses, or the next free port"
+    )
     parser.add_argument(
         "--web",
         metavar="[HOST:]PORT",
         nargs="?",
-        const=("", _PORT),
+        const=_DEFAULT_ADDRESS,
         type=_address,
         help=web,
     )
@@ -80,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.web is not None:
             from hand_eye_calib.online.watch.web import WebServer
 
-            server = WebServer(board, requests.put, arguments.web)
+            server = WebServer(board, requests.put, *arguments.web)
             stack.callback(server.stop)
             addresses = server.addresses()
             for address in addresses:
@@ -260,11 +265,11 @@ def _keyboard() -> Iterator[Callable[[], str]]:
         termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
-def _address(text: str) -> tuple[str, int]:
-    """Return host and port from PORT or HOST:PORT."""
+def _address(text: str) -> tuple[str, Sequence[int]]:
+    """Return the host, and a list of one port, from PORT or HOST:PORT."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or int(port) > 65535:
         raise argparse.ArgumentTypeError(
             f"expected PORT or HOST:PORT, got {text!r}; a port is at most 65535"
         )
-    return host.strip("[]"), int(port)
+    return host.strip("[]"), [int(port)]

@@ -6,6 +6,7 @@ in the address of the page, so other pages in the same browser cannot use the se
 """
 
 import contextlib
+import errno
 import hmac
 import json
 import os
@@ -100,9 +101,10 @@ class WebServer(ThreadingHTTPServer):
     ask : callable
         Function that is called in another thread with a request of ``view.KEYS``, or with a
         parameter and its value such as ``prior.z:=1.85m+/-0.02m``; ``prior.z:=`` removes the prior.
-    address : (str, int)
-        Host and port. An empty host stands for all addresses of the computer, and port 0 for any
-        free port.
+    host : str
+        Address to serve; empty for all addresses of the computer.
+    ports : sequence of int
+        Ports; the first one that is not in use is taken. Port 0 stands for any free port.
 
     Raises
     ------
@@ -114,21 +116,30 @@ class WebServer(ThreadingHTTPServer):
     block_on_close = False
 
     def __init__(
-        self, board: Board, ask: Callable[[str], None], address: tuple[str, int]
+        self,
+        board: Board,
+        ask: Callable[[str], None],
+        host: str,
+        ports: Sequence[int],
     ) -> None:
         self.key = _user_key()
         self.board = board
         self.ask = ask
         self.stopping = threading.Event()
-        self._host, port = address
-        try:
-            super().__init__(address, _Handler)
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise ConfigError(
-                f"cannot serve the page on {self._host}:{port}: {reason}; choose another with "
-                "--web PORT"
-            ) from None
+        self._host = host
+        for port in ports:
+            try:
+                super().__init__((host, port), _Handler)
+                break
+            except (OSError, OverflowError) as error:
+                is_in_use = getattr(error, "errno", None) == errno.EADDRINUSE
+                if is_in_use and port != ports[-1]:
+                    continue
+                reason = getattr(error, "strerror", None) or error
+                raise ConfigError(
+                    f"cannot serve the page on {host}:{port}: {reason}; choose another with "
+                    "--web PORT"
+                ) from None
         threading.Thread(
             target=self.serve_forever, name="web", daemon=True
         ).start()
