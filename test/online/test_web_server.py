@@ -92,7 +92,7 @@ def test_a_server_that_is_started_again_has_its_key_again_unless_others_can_read
 ):
     def started():
         server.stop()
-        server.__init__(Board(), print, ("127.0.0.1", server.server_port))
+        server.__init__(Board(), print, "127.0.0.1", [server.server_port])
         return server.key
 
     file = tmp_path / "hand_eye_calib" / "watch_key"
