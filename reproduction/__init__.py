@@ -1,3 +1,1 @@
-"""The experiments of Välimäki et al. 2023: their data, their published results, and our answers
-beside them.
-"""
+"""Experiments of Välimäki et al. 2023: published data and results, and our results on this data."""

@@ -1,4 +1,4 @@
-"""``python -m reproduction ID``: a figure or table of the paper, with a comparison with the
+"""``python -m reproduction ID``: make a figure or table of the paper, and compare it with the
 published results.
 """
 
@@ -37,7 +37,7 @@ EXPERIMENTS = {
     "s-figures": "S1-S5: as fig3, for the other methods",
     "s-tables": "S1-S12: every method and reference on both drives",
     "certificate": "study: which answers are proved to be global minima",
-    "faults": "study: faults on purpose, what is found and what the verdict is",
+    "faults": "study: deliberate faults, with their findings and verdicts",
     "all": "all figures and tables of the paper, its conclusions and our findings",
 }
 
@@ -45,8 +45,8 @@ _EPILOG = (
     "\n".join(f"{name:<13}{about}" for name, about in EXPERIMENTS.items())
     + """
 
-Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. Beside each,
-*_comparison.csv and *_comparison.md compare it with the published results, cell by cell.
+Every figure is written as PNG, SVG and CSV, every table as Markdown and CSV. The files
+*_comparison.csv and *_comparison.md compare them with the published results, cell by cell.
 Published data: clone github.com/tau-alma/trajectory_calibration_experiments and name its
 folder with --data-folder."""
 )
@@ -57,9 +57,9 @@ class Artefact:
     """A figure, a table or a text, with its comparison; its files begin with its name."""
 
     name: str
-    # What must be solved for it.
+    # Cells that must be solved before the files can be written.
     cells: list[Cell]
-    # Given the name and :class:`Results`, writes the files and returns their paths.
+    # ``write(name, results)`` writes the files and returns their paths.
     write: Callable[[str, Results], list[Path]]
 
 
@@ -94,9 +94,11 @@ GROUPS = {artefact.name: [artefact] for artefact in _PAPER} | {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run an experiment; returns the exit code."""
+    """Run an experiment and return the exit code."""
     parser = study_parser(
-        "reproduction", f"{__doc__}\n{_EPILOG}", "of certificate and faults"
+        "reproduction",
+        f"{__doc__}\n{_EPILOG}",
+        "put the tables of certificate or faults into this page",
     )
     add = parser.add_argument
     add(
@@ -115,7 +117,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--seed",
         type=int,
         default=0,
-        help="with --data simulated, and of the drives of faults. Default: 0",
+        help="seed of simulated drives, also those of faults. Default: 0",
     )
     add(
         "--runs",
@@ -145,16 +147,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the experiment; returns the exit code."""
+    """Run the experiment and return the exit code."""
     if arguments.jobs < 1 or arguments.runs < 2:
         raise ConfigError("--jobs must be at least 1, --runs at least 2")
     if arguments.id == "faults":
         text = faults.run(arguments)
     else:
-        results, files = made(
+        results, files = solve_and_write(
             arguments.id, _source(arguments), arguments.out, arguments.jobs
         )
-        text = said(results, files)
+        text = summary_of(results, files)
         if arguments.page is not None:
             page = (arguments.out / f"{arguments.id}.md").read_text(
                 encoding="utf-8"
@@ -176,11 +178,13 @@ def _source(arguments: argparse.Namespace) -> Source:
     return PublishedSource(published.find_folder(arguments.data_folder))
 
 
-def made(
+def solve_and_write(
     identifier: str, source: Source, out: Path, jobs: int
 ) -> tuple[Results, dict[str, list[Path]]]:
-    """Solve and write an experiment; gives what was solved, and the paths of the files by artefact.
-    What needs other data than the source has is left out. Raises ConfigError if that is all of it.
+    """Solve an experiment and write its files; return the results, and paths by artefact.
+
+    Artefacts that need data sets which the source does not have are left out. Raises ConfigError if
+    no artefact is left.
     """
     wanted = GROUPS[identifier]
     artefacts = [
@@ -194,7 +198,7 @@ def made(
         )
     if len(artefacts) < len(wanted):
         note(
-            "what is about the KITTI drives is left out: it needs the published data"
+            "figures and tables of the KITTI drives are left out: they need the published data"
         )
     out.mkdir(parents=True, exist_ok=True)
     todo = dict.fromkeys(
@@ -210,25 +214,23 @@ def made(
     }
 
 
-def said(results: Results, files: dict[str, list[Path]]) -> str:
-    """The text of a single artefact, how many rows agree, and where the files are."""
+def summary_of(results: Results, files: dict[str, list[Path]]) -> str:
+    """Return the text of a single artefact, the number of rows that agree, and the folder."""
     lines = []
-    for name, paths in files.items() if len(files) == 1 else ():
-        lines += [
-            path.read_text(encoding="utf-8")
-            for path in paths
-            if path.name == f"{name}.md"
-        ]
-    for method, rows in (
-        results.rows.groupby("method") if results.source.is_published else ()
-    ):
-        lines.append(
-            f"{TITLES[method]:<20}{rows['agrees'].sum():>6} of {len(rows):>5} rows agree"
-        )
-    count = sum(map(len, files.values()))
-    return "\n".join(
-        [*lines, f"{count} files written to {results.out}: {', '.join(files)}"]
-    )
+    if len(files) == 1:
+        (name,) = files
+        for path in files[name]:
+            if path.name == f"{name}.md":
+                lines.append(path.read_text(encoding="utf-8"))
+    if results.source.is_published:
+        for method, rows in results.rows.groupby("method"):
+            n_agreeing = rows["agrees"].sum()
+            lines.append(
+                f"{TITLES[method]:<20}{n_agreeing:>6} of {len(rows):>5} rows agree"
+            )
+    count = sum(len(paths) for paths in files.values())
+    lines.append(f"{count} files written to {results.out}: {', '.join(files)}")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.noise import estimator
 from hand_eye_calib.core.noise.tuning import TUNING
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.coverage.mixed import MIXED, make
 from reproduction.recordings import Rig, real_rigs
 from reproduction.writing import markdown_table, seed_of, show, study_parser
@@ -32,14 +33,11 @@ _FAMILIES = ("kitti", "euroc", "zxl19", "tango")
 # Errors (m, rad) below this are rounding. Recordings without noise are left out of the ratios.
 _ROUNDING = 1e-4
 
-# Ratio of errors (variant over full estimator) for a recording that the variant cannot solve.
+# Ratio of errors (variant / full estimator) that counts for a recording without a solution.
 _RATIO_OF_FAILURE = 3.0
 
 # Smallest ratio of errors: a ratio of zero has no logarithm.
 _MIN_RATIO = 1e-3
-
-# Half width of a 90 % interval, in standard deviations.
-_HALF_WIDTH_90 = 1.645
 
 
 def _with(**constants: object) -> dict[str, Any]:
@@ -142,10 +140,10 @@ class Outcome(NamedTuple):
 
 
 def outcome(case: Case, options: dict[str, Any]) -> Outcome | None:
-    """Return the errors of the estimator with these options; None if it fails.
+    """Return the errors of the estimator with these options; None if the estimator fails.
 
-    Half of the truth's standard deviation is added to the error, as a square. An improvement below
-    this uncertainty is chance, and so does not change the ratio much.
+    Half of the truth's standard deviation is added to the error in quadrature. Improvements smaller
+    than the uncertainty of the truth are chance, and then hardly change the ratio.
     """
     poses = case.poses
     try:
@@ -222,7 +220,7 @@ def _row(
         ratios = np.full(2, _RATIO_OF_FAILURE)
         if result is not None:
             ratios = result.errors / reference.errors
-            are_inside += (result.in_sigmas < _HALF_WIDTH_90).tolist()
+            are_inside += (result.in_sigmas < HALF_WIDTH_90).tolist()
         log_ratios_of_family = log_ratios.setdefault(case.family, [])
         log_ratios_of_family.append(np.log(np.maximum(ratios, _MIN_RATIO)))
     row = {"Without": name}

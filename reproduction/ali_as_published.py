@@ -1,15 +1,14 @@
-"""The variant of Ali that made the published simulation results; for comparison only, no method of
-this package.
+"""The variant of Ali's method behind the published simulation results, for comparison only.
 
-There the quaternion q = (w, x, y, z) was never normalised, and the matrix made of it is a rotation
-only where its length is 1:
+In this variant, the quaternion q = (w, x, y, z) is not normalised. The matrix that is fitted,
 
     M(q) = I + 2 sqrt(|q|) P(q),    P(q) = [[-yy-zz, xy-wz, xz+wy], [xy+wz, -xx-zz, yz-wx], [xz-wy,
-    yz+wx, -xx-yy]]
+    yz+wx, -xx-yy]],
 
-where a rotation would have ``1 / |q|^2`` for ``sqrt(|q|)``. The translation residual is minimised
-over q and t from the identity, and q is normalised only afterwards, so the rotation reported is not
-the one that was fitted (lengths between 0.5 and 1 are common with noise).
+is a rotation only if |q| = 1: a rotation has the factor ``1 / |q|^2`` in place of ``sqrt(|q|)``.
+The translation residual is minimised over q and t from the identity, and q is normalised only
+afterwards. The reported rotation therefore differs from the fitted matrix. With noise, |q| is often
+between 0.5 and 1.
 """
 
 import numpy as np
@@ -26,7 +25,7 @@ _STEP_TOLERANCE = 1e-10
 _LARGEST_START_GRADIENT = 100.0
 _SUFFICIENT_DECREASE = 1e-8
 
-# Share of the cost below which a rise is rounding.
+# Increases of the cost below this share of the cost are rounding.
 _ROUNDING = 10 * np.finfo(float).eps
 
 
@@ -34,10 +33,10 @@ def solve(pairs: MotionPairs) -> Solution:
     """Minimise the translation residual over an unnormalised quaternion, by Newton's method from
     the identity.
 
-    The cost has several minima, and which one is found depends on the steps. These are Ipopt's
-    (Wächter, Biegler 2006) as they are without constraints: the cost scaled to a start gradient of
-    at most 100, the Hessian shifted until it is positive definite, the step halved until the cost
-    falls.
+    The cost has several minima, and the steps decide which minimum is reached. The steps are those
+    of Ipopt (Wächter, Biegler 2006) without constraints. The cost is scaled to a start gradient of
+    at most 100, the Hessian is shifted until it is positive definite, and the step is halved until
+    the cost decreases.
 
     Parameters
     ----------
@@ -47,12 +46,12 @@ def solve(pairs: MotionPairs) -> Solution:
     Returns
     -------
     Solution
-        ``objective`` is the squared translation residual of the transform returned, not of the
-        matrix that was fitted. Where the cost keeps falling as q grows without bound, the answer is
-        not converged.
+        ``objective`` is the squared translation residual of the returned transform, not of the
+        fitted matrix. The solution has not converged if the cost still decreases while q grows
+        without bound.
     """
-    # Residuals through the triangular factor, not through its square: on noise-free data the square
-    # loses half of the digits.
+    # Residuals use the triangular factor R, not the normal matrix R^T R, which loses half of the
+    # digits on noise-free data.
     rows = np.asarray(np.linalg.qr(residual_rows(pairs), mode="r"))
     _, start_gradient, _ = _derivatives(_IDENTITY, rows)
     largest = max(np.abs(start_gradient).max(), np.finfo(float).tiny)

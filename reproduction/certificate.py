@@ -1,4 +1,4 @@
-"""``python -m reproduction certificate``: which answers are proved to be global minima."""
+"""``python -m reproduction certificate``: try to prove that answers are global minima."""
 
 import time
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ _HALF_TURNS = np.array(
     [np.diag(signs) for signs in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
 )
 
-# A minimum counts as false if its cost is higher by this share.
+# A minimum counts as false if its cost exceeds that of the answer by this share.
 _HIGHER = 1e-3
 
 
@@ -106,6 +106,7 @@ def prove_level(
 
 
 def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
+    """Yield the answers to be proved, by name; see the text of :func:`write`."""
     for name in ("dnl", "dnlo"):
         yield name, Method(name).solve(pairs)
     park = Method("park").solve(pairs)
@@ -119,12 +120,15 @@ def _answers(pairs: MotionPairs) -> Iterator[tuple[str, Solution]]:
 def _false_minima(
     Q: FloatArray, T_parent_child: FloatArray
 ) -> Iterator[FloatArray]:
-    value = float(
-        quadratic_form.minimise(Q, T_parent_child[None, :3, :3])[1][0]
-    )
-    Ts, values, _ = quadratic_form.minimise(
-        Q, T_parent_child[:3, :3] @ _HALF_TURNS
-    )
-    for T, other in zip(Ts, values, strict=True):
-        if other > value * (1 + _HIGHER) + 1e-9 * np.trace(Q):
+    """Yield local minima of the cost ``Q`` that are higher than the minimum near the answer.
+
+    The searches start at the answer rotated by pi about each axis.
+    """
+    rotation = T_parent_child[:3, :3]
+    _, costs, _ = quadratic_form.minimise(Q, rotation[None])
+    lowest = float(costs[0])
+    least_false = lowest * (1 + _HIGHER) + 1e-9 * np.trace(Q)
+    Ts, costs, _ = quadratic_form.minimise(Q, rotation @ _HALF_TURNS)
+    for T, cost in zip(Ts, costs, strict=True):
+        if cost > least_false:
             yield T

@@ -1,4 +1,4 @@
-"""Streams with other poses: filtered, delayed, turned, noisy. The parts of faults."""
+"""Changes of the poses of a stream: filter, delay, rotation, noise. Faults are made of them."""
 
 import dataclasses
 from typing import Any
@@ -18,7 +18,7 @@ def with_parts(
     rotations: FloatArray | None = None,
     positions: FloatArray | None = None,
 ) -> Trajectory:
-    """The stream with other orientations (N, 3, 3) or positions (N, 3)."""
+    """Return the stream with these orientations (N, 3, 3) or positions (N, 3)."""
     poses = stream.poses.copy()
     if rotations is not None:
         poses[:, :3, :3] = rotations
@@ -34,7 +34,7 @@ def posed(stream: Trajectory, poses: FloatArray) -> Trajectory:
 def moved_at(
     stream: Trajectory, where: Any, transforms: FloatArray
 ) -> Trajectory:
-    """The stream with some of its poses multiplied from the right."""
+    """Multiply the poses with index ``where`` by transforms from the right."""
     poses = stream.poses.copy()
     poses[where] = poses[where] @ transforms
     return posed(stream, poses)
@@ -51,7 +51,7 @@ def angles_of(stream: Trajectory) -> FloatArray:
 
 
 def turned(stream: Trajectory, angles: FloatArray) -> Trajectory:
-    """The stream with other yaw, pitch and roll (N, 3)."""
+    """Return the stream with these angles (N, 3): yaw, pitch and roll, rad."""
     rotations = Rotation.from_euler("ZYX", angles)
     return with_parts(stream, rotations.as_matrix())
 
@@ -62,7 +62,7 @@ def with_quats(stream: Trajectory, quats: FloatArray) -> Trajectory:
 
 
 def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
-    """Poses in the order of their stamps; of equal ones the first."""
+    """Sort poses by their stamps; of poses with equal stamps, keep the first."""
     whole_ns = np.asarray(stamps_ns).astype(np.int64)
     stamps_ns, first = np.unique(whole_ns, return_index=True)
     return Trajectory(stamps_ns, poses[first])
@@ -109,24 +109,25 @@ def filtered_rotations(stream: Trajectory, tau_s: float) -> FloatArray:
 
 
 def upright(stream: Trajectory, share: float = 1.0) -> Trajectory:
-    """A stream with a share less of roll and pitch."""
+    """Reduce roll and pitch by a share of their values; with 1, the stream is level."""
     remaining = 1.0 - share
     angles = angles_of(stream) * [1.0, remaining, remaining]
     return turned(stream, angles)
 
 
 def higher(stream: Trajectory, factor: float) -> Trajectory:
+    """Multiply the heights of a stream."""
     positions = positions_of(stream) * [1.0, 1.0, factor]
     return with_parts(stream, positions=positions)
 
 
 def delayed(stream: Trajectory, delay_s: float) -> FloatArray:
-    """Poses (N, 4, 4) as they were so long before."""
+    """Return the poses (N, 4, 4) at a time ``delay_s`` before each stamp."""
     later = stream.shifted(delay_s)
     return later.at(stream.stamps_ns, extrapolate=True)
 
 
 def beside(metres: float) -> FloatArray:
-    """Pose of another sensor beside the child."""
+    """Return the pose of another sensor that is shifted along the child's x axis."""
     translation = [metres, 0.0, 0.0]
     return se3.from_rotation_translation(np.eye(3), translation)

@@ -1,7 +1,7 @@
-"""Clean recordings, in which a stream check should find nothing: simulated ones of many kinds, and
-real ones with the options that they need.
+"""Clean recordings, in which the stream checks should find nothing.
 
-The limits of the checks were set with the first seeds of each kind. The seeds here are others.
+They are simulated recordings of many kinds, and real recordings with the options that they need.
+The limits of the checks were set with other seeds of the same kinds.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,8 @@ SEEDS = range(60, 65)
 # Noise (m; twice as many radians) of simulated hilly drives.
 _HILLY = {"hilly": 0.003, "hilly_noisy": 0.02}
 
-# What is really there besides what the options of a recording say.
+# Codes of correct findings by kind of recording. The names of a recording's options are such codes,
+# too.
 _KNOWN = {
     "hand_mixture_30s": frozenset({"jumps"}),
     "primesense": frozenset({"jumps", "time_offset"}),
@@ -37,14 +38,14 @@ _KNOWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class Clean:
-    """A clean recording; its name is its kind, and which one of it it is."""
+    """A clean recording; its name consists of its kind and its seed or drive."""
 
     name: str
     parent: Trajectory
     child: Trajectory
-    # The truth, if it is known.
+    # The true extrinsic, if it is known.
     T_parent_child: FloatArray | None = None
-    # Of the calibration.
+    # Options of the calibration.
     options: dict[str, Any] = field(default_factory=dict)
     is_real: bool = False
 
@@ -63,7 +64,7 @@ def kind_of(name: str) -> str:
 
 
 def known_in(name: str, folder: Path | None) -> frozenset[str]:
-    """Codes of the findings that are right in this recording."""
+    """Return the codes of the findings that are correct in this recording."""
     kind = kind_of(name)
     options = _real(folder)[name].options if name in _real(folder) else {}
     return _KNOWN.get(kind, frozenset()) | options.keys()

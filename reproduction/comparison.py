@@ -1,4 +1,4 @@
-"""Comparison with the published results: how many rows agree, and why others do not."""
+"""Comparison with the published results: how many rows agree, and why the other rows differ."""
 
 from pathlib import Path
 
@@ -8,11 +8,15 @@ import pandas as pd
 from reproduction.rows import METRICS, PUBLISHED, TITLES, UNITS
 from reproduction.writing import markdown_table, percent, write_csv
 
+# Largest number of rows that a page lists.
 _MOST_LISTED = 30
 
 
 def write_rows(path: Path, rows: pd.DataFrame) -> Path:
-    """Every row with ours, theirs and why they differ, as CSV; returns the path."""
+    """Write all rows as CSV: our errors, the published errors, and why they differ.
+
+    Returns the path.
+    """
     named = {
         name: f"{name}_{UNITS[name.removeprefix('published_')]}"
         for name in (*METRICS, *PUBLISHED)
@@ -23,7 +27,7 @@ def write_rows(path: Path, rows: pd.DataFrame) -> Path:
 
 
 def describe_rows(rows: pd.DataFrame) -> str:
-    """Markdown: how many rows agree, by method, and the reasons why others do not."""
+    """Return Markdown: how many rows of each method agree, and why the other rows differ."""
     table = markdown_table(
         {
             "method": TITLES[method],
@@ -55,25 +59,26 @@ def describe_rows(rows: pd.DataFrame) -> str:
 
 
 def describe_dnlo(rows: pd.DataFrame) -> str:
-    """Markdown: the objectives of DNLO against those at the published answers, and how far the
-    errors moved.
+    """Return Markdown: objectives of DNLO at our answers and at the published answers, and the
+    change of the errors.
     """
     rows = rows[rows["method"] == "dnlo"]
+    counts = rows["verdict"].value_counts()
     lower, equal, higher = (
-        int((rows["verdict"] == x).sum()) for x in ("lower", "equal", "higher")
+        int(counts.get(verdict, 0)) for verdict in ("lower", "equal", "higher")
     )
     others = rows[~rows["same_e_at"]]
     text = (
-        "DNLO has many local minima and is compared by its objective, eq. (5), taken by the same "
-        f"formula at our and at the published answer: lower in {lower} of {len(rows)} "
-        f"rows, equal within 1e-6 in {equal}, higher in {higher}. e_at is "
-        f"the published one in {percent(len(rows) - len(others), len(rows))}."
+        "DNLO has many local minima, so its objectives, eq. (5), are compared. The same formula "
+        "gives the objective at our answer and at the published answer. Ours is lower in "
+        f"{lower} of {len(rows)} rows, equal within 1e-6 in {equal}, higher in {higher}. e_at "
+        f"equals the published value in {percent(len(rows) - len(others), len(rows))}."
     )
     if len(others):
         moved = (others["e_at"] - others["published_e_at"]).to_numpy()
         text += (
-            f" Where it is not, it moved by {np.median(np.abs(moved)):.2g} m (median; at most "
-            f"{np.abs(moved).max():.2g} m) and is smaller than the published one in "
+            f" In the other rows, e_at differs by {np.median(np.abs(moved)):.2g} m (median; at "
+            f"most {np.abs(moved).max():.2g} m), and is smaller than the published value in "
             f"{percent((moved < 0).sum(), len(moved))}: a lower objective is not always a smaller "
             "error."
         )
@@ -81,7 +86,7 @@ def describe_dnlo(rows: pd.DataFrame) -> str:
 
 
 def reasons(rows: pd.DataFrame) -> str:
-    """Why rows differ, with counts, in one string."""
+    """Return the reasons why rows differ, with their counts."""
     whys = rows["why"]
     is_explained = ~rows["agrees"] & (whys != "")
     counts = whys[is_explained].value_counts()

@@ -1,6 +1,6 @@
-"""The paper's conclusions: whether our run shows each of them, and by which figures.
+"""The paper's conclusions, checked: a verdict on every conclusion, and the numbers behind it.
 
-On simulated drives, "Ali" is the variant as published; "Ali proper" is ours.
+On simulated drives, "Ali" is the variant as published; "Ali proper" is our implementation.
 """
 
 from __future__ import annotations
@@ -23,21 +23,23 @@ from reproduction.tables import best_variants, with_rectified
 from reproduction.writing import write_csv, write_text
 
 _AS_PUBLISHED = (ALI_AS_PUBLISHED, "dnl", "dnlo", "park", "taylor", "zhuang")
+# Errors e_at (m) up to this value count as zero.
 _NOISE_FREE = 1e-6
+# Columns of the tables.
 _RT = "e_rt (m)"
 _AT = "e_at (m)"
 _RECTIFIED = "rectified: e_at (m)"
 
 
 class Shown:
-    """What the results show, as the rules need it."""
+    """Scores and rows of a run, in the form that the rules need."""
 
     def __init__(self, results: Results) -> None:
         self.results = results
         self.table: Table = results.ours
 
     def dnlo(self, dataset: str, metric: str = "e_at") -> dict[str, float]:
-        """Scores of DNLO by reference."""
+        """Return the scores of DNLO by reference."""
         return {
             name: self.table.score(dataset, "dnlo", name, metric)
             for name in REFERENCES
@@ -45,7 +47,7 @@ class Shown:
 
     @cached_property
     def best(self) -> dict[str, dict[str, str]]:
-        """The best reference by data set and method."""
+        """Best reference by data set and method."""
         return {
             dataset: {
                 method: self.table.best_reference(dataset, method)
@@ -55,14 +57,14 @@ class Shown:
         }
 
     def scores(self, dataset: str) -> dict[str, float]:
-        """Scores of the best variants by method."""
+        """Return the score of each method with its best reference."""
         scores = {}
         for method, reference in self.best[dataset].items():
             scores[method] = self.table.score(dataset, method, reference)
         return scores
 
     def drift(self, method: str) -> tuple[float, list[float]]:
-        """Mean e_at with the largest drift: of reference A, and of the other references."""
+        """Return the mean e_at with the largest drift: for reference A, and for all others."""
         means = []
         for reference in REFERENCES:
             summary = self.table.summary(
@@ -83,14 +85,14 @@ class Shown:
         return drives
 
     def variants(self, drive: str, by: str = _AT) -> dict[str, str]:
-        """The best reference of each method on a drive."""
+        """Return the reference with the smallest error ``by``, for each method on a drive."""
         best = best_variants(self.drives[drive], by)
         return dict(best.index)
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Whether a claim holds, or holds in part, and the figures that show it."""
+    """Whether a claim holds, or holds in part, and the numbers that show it."""
 
     holds: Any
     evidence: str
@@ -106,12 +108,12 @@ class Judgement:
         return "Does not hold"
 
 
-# The docstring of a rule is the claim.
+# The docstring of each rule is the claim of the paper that the rule checks.
 RULES: list[Callable[[Shown], Judgement]] = []
 
 
 def write(name: str, results: Results) -> list[Path]:
-    """Write ``NAME.md`` and ``NAME.csv``; returns the paths."""
+    """Write ``NAME.md`` and ``NAME.csv``, and return their paths."""
     shown = Shown(results)
     rows = []
     blocks = ["# The paper's conclusions, checked"]
@@ -130,7 +132,7 @@ def write(name: str, results: Results) -> list[Path]:
 
 
 def _listed(values: Mapping[str, Any], form: str = "") -> str:
-    """Methods or references with their values."""
+    """Return methods or references with their values as text."""
     words = []
     for name, value in values.items():
         title = TITLES.get(name, name)
@@ -466,7 +468,7 @@ def _errors_of_variants(shown: Shown, dataset: str) -> FloatArray:
 
 
 def _median_ratio(errors: FloatArray, axis: int) -> float:
-    """Median of the largest error over the smallest one along an axis."""
+    """Return the median of the ratios of the largest to the smallest error along an axis."""
     largest = errors.max(axis=axis)
     smallest = errors.min(axis=axis)
     return float(np.median(largest / smallest))

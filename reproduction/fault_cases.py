@@ -1,4 +1,4 @@
-"""Faults that give a wrong extrinsic in confidence, made on purpose in two streams.
+"""Deliberate faults of two streams that make the extrinsic wrong although its sigma is small.
 
 The limits of the checks were set with these faults.
 """
@@ -34,6 +34,7 @@ from reproduction.fault_entry import (
     group,
 )
 
+# Codes of the findings for positions that are filtered or late.
 _POSITIONS = "smoothed_positions position_clock"
 
 
@@ -62,7 +63,10 @@ def copied(
 def fused(
     parent: Trajectory, child: Trajectory, noise: float, random: Random
 ) -> Streams:
-    """Positions from the parent's, turned by the rotation that both orientations give."""
+    """Replace the child's positions by those of the parent.
+
+    The orientations of both streams give the rotation between their worlds.
+    """
     is_shared = child.stamps_ns >= parent.stamps_ns[0]
     is_shared &= child.stamps_ns <= parent.stamps_ns[-1]
     child = child[is_shared]
@@ -72,13 +76,15 @@ def fused(
     parent_steps = _rotation_steps(parent_rotations[::10])
     child_steps = _rotation_steps(child_rotations[::10])
     aligned, _ = Rotation.align_vectors(parent_steps, child_steps)
-    X = aligned.as_matrix()
+    R_parent_child = aligned.as_matrix()
 
-    # The child's world in the parent's, from the orientations at the start and a common origin.
-    turned = child_rotations[0] @ X.T @ parent_rotations[0].T
+    # Rotation from the parent's world to the child's world; both worlds get the same origin.
+    R_cw_c = child_rotations[0]
+    R_pw_p = parent_rotations[0]
+    R_cw_pw = R_cw_c @ R_parent_child.T @ R_pw_p.T
     parent_positions = se3.translation_of(at_child)
     travelled = parent_positions - parent_positions[0]
-    positions = travelled @ turned.T
+    positions = travelled @ R_cw_pw.T
     positions += noise * random.standard_normal(positions.shape)
     return parent, with_parts(child, positions=positions)
 
@@ -171,7 +177,10 @@ child_alone(
     named="rotation_gain",
 )
 def yaw_gain(child: Trajectory, gain: float, _: Random) -> Trajectory:
-    """About the vehicle's vertical: the main axis of rotation in the child's frame."""
+    """Multiply rotations about the vertical by ``1 + gain``.
+
+    The vertical is the main axis of rotation in the child's frame.
+    """
     steps = se3.inverse(child.poses[:-1]) @ child.poses[1:]
     vectors = se3.rotation_log(se3.rotation_of(steps))
     moments = vectors.T @ vectors
@@ -193,7 +202,7 @@ def yaw_gain(child: Trajectory, gain: float, _: Random) -> Trajectory:
     named="mount_moved",
 )
 def loosened(child: Trajectory, degrees: float, random: Random) -> Trajectory:
-    """By so many degrees and 2.5 cm for each."""
+    """Turn and shift the mount half-way: by ``degrees``, and by 2.5 cm per degree."""
     axes = random.standard_normal((2, 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     translation = 0.025 * degrees * axes[0]
@@ -242,7 +251,7 @@ child_alone(
 def as_float32(
     parent: Trajectory, child: Trajectory, metres: float, _: Random
 ) -> Streams:
-    """Far from the origin, both streams on one map."""
+    """Store the positions of both streams as float32, on a map whose origin is far away."""
     origin = np.array([metres, 9.0 * metres, 0.0])
     streams = []
     for stream in (parent, child):
@@ -311,7 +320,7 @@ child_alone(
     named="jumps",
 )
 def jumping(child: Trajectory, share: float, random: Random) -> Trajectory:
-    """Lasting, of some 30 cm."""
+    """Add lasting jumps of 30 cm per axis (1 sigma), at a share of the poses."""
     count = len(child)
     shifts = np.zeros((count, 3))
     rows = random.integers(count, size=round(share * count))

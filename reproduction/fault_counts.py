@@ -1,4 +1,4 @@
-"""Counts of a study of faults: verdicts, findings, and errors of results that may be used."""
+"""Counts of a study of faults: verdicts, findings, and errors of results that are not refused."""
 
 from collections import Counter
 from collections.abc import Set
@@ -18,7 +18,12 @@ FAR_SIGMAS = 3.3
 
 @dataclass
 class Tally:
-    """Counts of the results of recordings with one fault."""
+    """Counts of the results of recordings with one fault.
+
+    ``n_named`` counts results with a finding that names the fault, ``n_with_findings`` results with
+    any finding, and ``n_far`` results with the verdict USE that are wrong. ``largest_ratio`` is the
+    largest error in standard deviations of results that are not DO NOT USE.
+    """
 
     verdicts: Counter[str] = field(default_factory=Counter)
     codes: Counter[str] = field(default_factory=Counter)
@@ -30,8 +35,8 @@ class Tally:
     def add(self, result: Calibration, ratio: float, names: Set[str]) -> None:
         """Count a result.
 
-        ``ratio`` is its largest error in standard deviations. Findings with a code in ``names``
-        name the fault.
+        ``ratio`` is the largest error of the result in standard deviations. Findings with a code in
+        ``names`` name the fault.
         """
         self.verdicts[result.verdict.value] += 1
         codes = set()
@@ -51,7 +56,7 @@ class Tally:
         return {"Verdicts": counted(self.verdicts.elements())}
 
     def error_cells(self) -> dict[str, object]:
-        """Return the cells of a row about errors of results that may be used."""
+        """Return the cells of a row about errors of results that are not refused."""
         return {
             "USE beyond 3.3 sigma": self.n_far,
             "Largest z that is not DO NOT USE": f"{self.largest_ratio:.1f}",

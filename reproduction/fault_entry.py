@@ -1,4 +1,7 @@
-"""Faults of two streams, entered by decorators: what is wrong, how much, and who names it."""
+"""Register of deliberate faults of two streams: damage, severities, and codes of findings.
+
+Decorators add the faults to the register.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,23 +17,27 @@ _OfBoth = Callable[[Trajectory, Trajectory, float, Random], Streams]
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: its code, and what is wrong in words."""
+    """A deliberate fault of two streams."""
 
     code: str
+    # Description in words.
     what: str
-    # The weakest first; one if it has no degrees.
+    # Weakest severity first; a single value if the fault has only one strength.
     severities: tuple[float, ...]
+    # Unit of the severities.
     unit: str
-    # ``damage(parent, child, severity, generator)``.
+    # ``damage(parent, child, severity, generator)`` returns the streams with the fault.
     damage: _OfBoth
-    # Codes of findings that name it; empty if the checks were built without it.
+    # Codes of findings that name the fault; empty if no check was made for this fault.
     named: frozenset[str] = frozenset()
-    # Of the calibration, besides its method.
+    # Options of the calibration, besides its method.
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
 _ENTERED: list[Fault] = []
+# Severities of a fault with three variants.
 THREE = (0.0, 1.0, 2.0)
+# Severities of filters and delays (s).
 SECONDS = (0.05, 0.1, 0.2)
 
 
@@ -42,7 +49,7 @@ def both(
     named: str = "",
     **options: Any,
 ) -> Callable[[_OfBoth], _OfBoth]:
-    """Enter a fault of both streams; ``named`` has the codes, a space between them."""
+    """Register a fault of both streams; ``named`` contains the codes, separated by spaces."""
 
     def enter(damage: _OfBoth) -> _OfBoth:
         names = frozenset(named.split())
@@ -55,7 +62,7 @@ def both(
 
 
 def child_alone(**about: Any) -> Callable[[_OfChild], _OfChild]:
-    """Enter a fault of the child's stream alone; arguments are those of :func:`_both`."""
+    """Register a fault of the child's stream alone; the arguments are those of :func:`both`."""
 
     def enter(change: _OfChild) -> _OfChild:
         def damage(
@@ -70,5 +77,5 @@ def child_alone(**about: Any) -> Callable[[_OfChild], _OfChild]:
 
 
 def group(initials: str) -> tuple[Fault, ...]:
-    """Return the entered faults whose codes have one of these initials."""
+    """Return the registered faults whose codes begin with one of these letters."""
     return tuple(fault for fault in _ENTERED if fault.code[0] in initials)

@@ -1,8 +1,10 @@
-"""Study of faults: each one in simulated and real recordings, in three severities. Which finding
-names it, what the verdict is, and how wrong the answer is, in its own standard deviations.
+"""Study of deliberate faults in simulated and real recordings, in up to three severities.
 
-``python -m reproduction faults --data-folder DIR --page docs/faults.md`` writes the page. A run
-that was interrupted goes on from ``faults.jsonl``. ``--clean`` solves the clean recordings alone.
+The study counts the findings and verdicts of each fault, and computes the largest error in standard
+deviations.
+
+``python -m reproduction faults --data-folder DIR --page docs/faults.md`` writes the page. An
+interrupted run continues from ``faults.jsonl``. ``--clean`` solves the clean recordings alone.
 """
 
 import argparse
@@ -35,31 +37,35 @@ from reproduction.runner import kept
 from reproduction.writing import counted, markdown_table, put_into_page
 
 METHODS: tuple[MethodName, ...] = ("dnlo", "auto")
-# Simulated drives that faults are put into.
+# Number of simulated drives that get faults.
 _N_DRIVES = 2
 _NOISE = NoiseConfig(gaussian=0.003)
+# Real recordings that get faults.
 _TANGO = ("tango_caligula_mars",)
+# Errors above this number of standard deviations are listed.
 _LIMIT_Z = 3.3
 
-# Poses are downsampled to so many for the solves; the checks see all.
+# Number of pose pairs for the solves; the checks use all poses.
 _MAX_PAIRS = 400
 
 _NO_ANSWER = "no answer"
+# Words of the tables for the verdicts.
 _SHORT = {"DO NOT USE": "no", "USE WITH CARE": "care", "USE": "use"}
 
-# Fault of a case without one, in a recording that the faults are put into, and in a clean one.
+# ``Case.fault`` of a recording that gets faults in other cases, here without a fault.
 _SOUND = "none"
+# ``Case.fault`` of a clean recording.
 _CLEAN = "clean"
 
-# Groups of the page: title to faults.
+# Faults by the titles of the tables of the page.
 GROUPS = {
     "Faults": FAULTS,
-    "Faults that were built later, without a limit for them": LATER,
-    "Faults that were silent before their columns": SILENT,
+    "Faults added after the limits of the checks were set": LATER,
+    "Faults without a finding before the check estimated a parameter for them": SILENT,
 }
 _FAULTS = {fault.code: fault for fault in chain(*GROUPS.values())}
 
-# Rules of the verdict that state how a recording is, not that something is wrong.
+# Rules of the verdict that describe a sound recording: its motion, its outliers, its findings.
 _PHYSICAL = frozenset(
     {
         "unobservable",
@@ -68,14 +74,14 @@ _PHYSICAL = frozenset(
         "floor",
         "outliers",
         "warning_finding",
+        "error_finding",
     }
-    | {"error_finding"}
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """What is solved: a fault, or none, in one recording, by one method."""
+    """A calibration of the study: a recording with or without a fault, and a method."""
 
     fault: str
     severity: int
@@ -91,25 +97,26 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a case ended."""
+    """Result of a case."""
 
+    # Name of the case.
     key: str
     verdict: str
-    # Codes of errors and warnings, ``note:`` before those of notes.
+    # Codes of findings; ``note:`` precedes the codes of notes.
     findings: list[str]
-    # Error of the answer.
+    # Errors of the extrinsic.
     metres: float = math.nan
     degrees: float = math.nan
-    # Largest error of an axis in its stated standard deviations; axes that are stated as
-    # unobservable do not count.
+    # Largest error of an observable axis, in standard deviations.
     z: float = math.nan
-    # Of the verdict's reasons.
+    # Rules of the verdict's reasons.
     rules: list[str] = field(default_factory=list)
 
 
 def run(arguments: argparse.Namespace) -> str:
-    """Solve the cases, and write the text about them and those solved before into the page; returns
-    the text.
+    """Solve the cases that the file does not contain, and return the text about all cases.
+
+    The text is written into the page, if a page is given.
     """
     folder = arguments.data_folder
     out = arguments.out
@@ -131,7 +138,7 @@ def _plain_outcome(case: Case, folder: Path | None) -> dict[str, Any]:
 
 
 def recordings(folder: Path | None, first_seed: int = 0) -> list[str]:
-    """Names of the recordings that faults are put into; simulated drives from a seed on."""
+    """Return the names of the recordings that get faults; ``first_seed`` is for the drives."""
     seeds = range(first_seed, first_seed + _N_DRIVES)
     names = [f"hilly_{seed}" for seed in seeds]
     if folder:
@@ -140,7 +147,7 @@ def recordings(folder: Path | None, first_seed: int = 0) -> list[str]:
 
 
 def cases(folder: Path | None, first_seed: int = 0) -> list[Case]:
-    """All cases of the study: recordings without faults, with each fault, and clean recordings."""
+    """Return all cases: recordings without a fault, with each fault, and clean recordings."""
     names = recordings(folder, first_seed)
     cases_of_study = _cases(_SOUND, 1, names)
     for code, fault in _FAULTS.items():
@@ -149,7 +156,7 @@ def cases(folder: Path | None, first_seed: int = 0) -> list[Case]:
 
 
 def clean_cases(folder: Path | None) -> list[Case]:
-    """The clean recordings, by the default method."""
+    """Return the cases of the clean recordings, for the default method."""
     names = clean_recordings.names(folder)
     return _cases(_CLEAN, 1, names, methods=("auto",))
 
@@ -193,14 +200,14 @@ def outcome(case: Case, folder: Path | None) -> Outcome:
 
 def _of_clean(case: Case, folder: Path | None) -> Outcome:
     clean = clean_recordings.recording(case.recording, folder)
-    # All poses of real recordings, as a user would.
+    # Real recordings are solved with all poses, as by a user.
     options = clean.options if clean.is_real else {"max_pairs": _MAX_PAIRS}
     result = calibrate(clean.parent, clean.child, method=case.method, **options)
     return _judged(case.key, result, clean.T_parent_child)
 
 
 def _named(findings: Iterable[Any]) -> list[str]:
-    """Codes of findings; ``note:`` precedes the codes of notes."""
+    """Return the codes of findings; ``note:`` precedes the codes of notes."""
     codes = []
     for finding in findings:
         is_note = finding.severity is Severity.NOTE
@@ -211,7 +218,7 @@ def _named(findings: Iterable[Any]) -> list[str]:
 def _judged(
     key: str, result: Calibration, T_parent_child: FloatArray | None
 ) -> Outcome:
-    """Outcome of a result; without a truth, errors are NaN."""
+    """Return the outcome of a result; errors are NaN if the truth is not known."""
     outcome = Outcome(
         key=key,
         verdict=result.verdict.value,
@@ -224,20 +231,20 @@ def _judged(
     rotation = se3.rotation_of(T_parent_child)
     translation_errors = rotation @ xi[:3]
     errors = np.concatenate([translation_errors, rotation @ xi[3:]])
-    is_seen = np.isfinite(result.sigmas)
-    sigmas = np.maximum(result.sigmas[is_seen], 1e-9)
-    ratios = np.abs(errors[is_seen]) / sigmas
+    is_observed = np.isfinite(result.sigmas)
+    sigmas = np.maximum(result.sigmas[is_observed], 1e-9)
+    ratios = np.abs(errors[is_observed]) / sigmas
     radians = np.linalg.norm(xi[3:])
     return replace(
         outcome,
-        metres=float(np.linalg.norm(translation_errors[is_seen[:3]])),
+        metres=float(np.linalg.norm(translation_errors[is_observed[:3]])),
         degrees=float(np.degrees(radians)),
         z=float(ratios.max(initial=0.0)),
     )
 
 
 class _Sound(NamedTuple):
-    """A recording without a fault, and its answer."""
+    """A recording without a fault, and its extrinsic."""
 
     parent: Trajectory
     child: Trajectory
@@ -246,7 +253,11 @@ class _Sound(NamedTuple):
 
 @cache
 def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
-    """Return a recording without a fault; the answer of a real one has no fault either."""
+    """Return a recording without a fault, and its extrinsic.
+
+    The clock offset and the scale of a real recording are corrected. Its extrinsic is estimated
+    from the corrected streams.
+    """
     if name.startswith("hilly"):
         _, seed = name.rsplit("_", 1)
         drive = simulate_drive(int(seed), HILLY_DRIVE, _NOISE)
@@ -257,7 +268,9 @@ def _sound(name: str, method: MethodName, folder: Path | None) -> _Sound:
     parent = recording.parent
     child = recording.child
     checked = check_streams(parent, child)
-    offset = next(f for f in checked.findings if f.code == "time_offset")
+    offset = next(
+        finding for finding in checked.findings if finding.code == "time_offset"
+    )
     child = child.shifted(float(offset.options["time_offset"]))
     scale = checked.fit.scale if checked.fit else 1.0
     child = child.scaled(scale)
@@ -272,8 +285,8 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
     """Return the text of the page."""
     by_fault: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
-        fault, *_ = outcome.key.split()
-        by_fault.setdefault(fault, []).append(outcome)
+        code, *_ = outcome.key.split()
+        by_fault.setdefault(code, []).append(outcome)
     clean = by_fault.pop(_CLEAN, [])
     sound = by_fault.pop(_SOUND, [])
     faulty = list(chain.from_iterable(by_fault.values()))
@@ -282,9 +295,9 @@ def report(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         parts += [_about(faulty), _unsafe_text(faulty), _sound_text(sound)]
     for title, faults in GROUPS.items():
         rows = []
-        for case in faults:
-            if case.code in by_fault:
-                rows.append(_row(case, by_fault[case.code]))
+        for fault in faults:
+            if fault.code in by_fault:
+                rows.append(_row(fault, by_fault[fault.code]))
         if rows:
             parts.append(f"### {title}\n\n{markdown_table(rows)}")
     if clean:
@@ -298,15 +311,15 @@ def _about(faulty: Sequence[Outcome]) -> str:
     return (
         f"{len(faulty)} calibrations with `{methods}`: of simulated hilly "
         "drives of 120 s at 1.5 m/s (hilly), and of recordings of hand-held devices (tango), "
-        "whose answer without the fault counts as the truth. z is the largest error of an "
-        "axis, divided by its standard deviation with the allowance. Verdicts "
-        "and the three most frequent findings are counted: `no` is DO NOT USE, "
-        "`care` USE WITH CARE."
+        "whose result without the fault counts as the truth. z is the largest error of an "
+        "axis, divided by its standard deviation with the allowance. A number behind a finding or "
+        "verdict is the number of calibrations; the three most frequent findings are listed. `no` "
+        "is DO NOT USE, `care` is USE WITH CARE."
     )
 
 
 def _unsafe_text(faulty: Sequence[Outcome]) -> str:
-    """Return the text about wrong results that may be used, with a line for each."""
+    """Return the text about wrong results with the verdict USE, with a line for each result."""
     lines = []
     for outcome in faulty:
         if outcome.verdict == "USE" and outcome.z > _LIMIT_Z:
@@ -315,20 +328,18 @@ def _unsafe_text(faulty: Sequence[Outcome]) -> str:
                 f"- {outcome.key}: z {outcome.z:.1f}, {millimetres:.0f} mm, "
                 f"{outcome.degrees:.2f} deg"
             )
-    end = ":" if lines else "."
     about = (
-        f"{len(lines)} of them are more than {_LIMIT_Z:g} standard deviations off and called "
-        f"USE{end}"
+        f"Results with the verdict USE and an error above {_LIMIT_Z:g} standard deviations: "
+        f"{len(lines)}."
     )
-    listed = "\n".join(lines)
-    return f"{about}\n{listed}"
+    return "\n".join([about, *lines])
 
 
 def _sound_text(sound: Sequence[Outcome]) -> str:
-    """Return the text about the same recordings without a fault."""
+    """Return the text about the same recordings before they got faults."""
     largest = max((outcome.z for outcome in sound), default=0.0)
     return (
-        f"Without a fault, these recordings end in {_verdicts_in_full(sound)}; z is "
+        f"Without a fault, the verdicts are {_verdicts_in_full(sound)}; z is "
         f"at most {largest:.1f}."
     )
 
@@ -368,7 +379,9 @@ class _CleanGroup:
     wrong_codes: list[str] = field(default_factory=list)
 
     def is_listed(self) -> bool:
-        """Whether a finding is wrong, a reason is not physical, or an error is large."""
+        """Whether a finding is wrong, an error is large, or a reason does not describe the
+        recording.
+        """
         are_far = [outcome.z > _LIMIT_Z for outcome in self.outcomes]
         are_physical = [_is_physical(outcome) for outcome in self.outcomes]
         return bool(self.wrong_codes) or any(are_far) or not all(are_physical)
@@ -391,14 +404,14 @@ class _CleanGroup:
 
 
 def _is_physical(outcome: Outcome) -> bool:
-    """Whether all reasons of the verdict state how the recording is."""
+    """Whether all reasons of the verdict describe the recording itself."""
     return _PHYSICAL.issuperset(outcome.rules)
 
 
 def _clean_groups(
     outcomes: Sequence[Outcome], folder: Path | None
 ) -> dict[str, _CleanGroup]:
-    """Return the clean recordings by kind; only the first wrong finding of each counts."""
+    """Return the clean recordings by kind; of each recording, only one wrong finding counts."""
     groups: dict[str, _CleanGroup] = {}
     for outcome in outcomes:
         # Fault, severity, name and method.
@@ -416,7 +429,7 @@ def _clean_groups(
 
 
 def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
-    """Return how clean recordings end, and which findings in them are wrong."""
+    """Return the text about clean recordings: wrong findings and verdicts."""
     groups = _clean_groups(outcomes, folder)
     n_wrong = sum(len(group.wrong_codes) for group in groups.values())
     n_own = sum(_is_physical(outcome) for outcome in outcomes)
@@ -424,9 +437,10 @@ def _clean_text(outcomes: Sequence[Outcome], folder: Path | None) -> str:
         group.row(kind) for kind, group in groups.items() if group.is_listed()
     ]
     return (
-        f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, solved with the default "
-        f"method. {n_own} of {len(outcomes)} results are called USE or have reasons that the "
-        "recording itself has: an axis that the motion does not show, or less well than the "
-        "target, the common-mode floor, outliers, a finding that is right. Listed are the others, "
-        f"and what is more than {_LIMIT_Z:g} standard deviations off.\n\n{markdown_table(rows)}"
+        f"Wrong findings in {n_wrong} of {len(outcomes)} clean recordings, with the default "
+        f"method. {n_own} of {len(outcomes)} results have the verdict USE, or only reasons that "
+        "describe the recording: an axis that the motion does not determine, or not as well as the "
+        "target asks; the common-mode floor; outliers; a correct finding. The table lists the "
+        f"other results, and results with an error above {_LIMIT_Z:g} standard deviations."
+        f"\n\n{markdown_table(rows)}"
     )

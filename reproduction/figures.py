@@ -1,5 +1,5 @@
-"""Figures 3, 5 and S1-S5 (errors on simulated drives) and 4 (components of the motions), with their
-comparisons.
+"""Figures 3, 5 and S1-S5 (errors on simulated drives), Figure 4 (components of the motions), and
+their comparisons with the published figures.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ from reproduction.results import Results, Summary, Table, quartile_summary
 from reproduction.rows import ALI_AS_PUBLISHED, METRICS, TITLES, agree
 from reproduction.writing import percent, write_csv, write_text
 
-# Data set, method, reference.
+# Data set, method and reference of a plotted line.
 Choice = tuple[str, str, str]
 
+# Methods of each figure. Figures of a single method have a line for each reference.
 FIGURE_METHODS = {
     "fig3": ("dnlo",),
     "fig5": (
@@ -44,22 +45,27 @@ _INTERVALS = (
     "Mean and 95 % confidence interval; mixed noise: median, quartiles, whiskers to 1.5 "
     "interquartile ranges. Axes linear near zero, then logarithmic."
 )
+# Titles that are too long for a label beside a line.
+_SHORT_TITLES = {ALI_AS_PUBLISHED: "Ali publ."}
 _COMPONENTS = ("x", "y", "z", "roll", "pitch", "yaw")
+# Columns that identify a plotted point.
 _POINT = ["dataset", "level", "method", "reference", "metric"]
 
 
 def write_error_figure(name: str, results: Results) -> list[Path]:
-    """Write a figure of :data:`FIGURE_METHODS`, its numbers and comparison; returns the paths."""
+    """Write a figure of :data:`FIGURE_METHODS`, its numbers and its comparison.
+
+    Returns the paths of the files.
+    """
     table = results.ours
     methods = FIGURE_METHODS[name]
-    choices = [
-        choice
-        for dataset in SIMULATED
-        for choice in _choices(dataset, methods, table)
-    ]
+    choices: list[Choice] = []
+    for dataset in SIMULATED:
+        choices += _choices(dataset, methods, table)
     numbers = _numbers(choices, table)
+    title, note = _titles(name, results)
     paths = [
-        *_draw(*_titles(name, results), choices, results, results.out / name),
+        *_draw(title, note, choices, results, results.out / name),
         write_csv(results.out / f"{name}.csv", numbers),
     ]
     if results.source.is_published:
@@ -70,9 +76,7 @@ def write_error_figure(name: str, results: Results) -> list[Path]:
 def _choices(
     dataset: str, methods: Sequence[str], table: Table
 ) -> list[Choice]:
-    """(dataset, method, reference) shown: every reference of a single method, else the best of
-    each.
-    """
+    """Return the lines to plot: all references of a single method, or the best of each method."""
     if len(methods) == 1:
         return [(dataset, methods[0], reference) for reference in REFERENCES]
     return [
@@ -102,6 +106,7 @@ def _numbers(choices: Sequence[Choice], table: Table) -> pd.DataFrame:
 
 
 def _where(number: str, results: Results) -> tuple[str, str]:
+    """Return the name of a figure, and its trajectories in words."""
     runs = results.source.runs
     if results.source.is_published:
         return f"Figure {number}", f"{runs} published trajectories"
@@ -109,12 +114,13 @@ def _where(number: str, results: Results) -> tuple[str, str]:
 
 
 def _titles(name: str, results: Results) -> tuple[str, str]:
+    """Return the title and the note of a figure."""
     label = name.removeprefix("fig").removesuffix("_proper")
     number, where = _where(label, results)
     if name == "fig5":
         note = (
-            f"{_INTERVALS}\nThe variant of each method is the one with the smallest e_at; Ali "
-            "as published: its quaternion was never normalised."
+            f"{_INTERVALS}\nThe best variant of a method has the smallest e_at. The quaternion of "
+            "Ali as published was not normalised."
         )
         return (
             f"{number}. Calibration errors of each method's best variant on {where}",
@@ -137,52 +143,60 @@ def _draw(
     results: Results,
     stem: Path,
 ) -> list[Path]:
+    """Draw the figure of these choices; return the paths of its files."""
+    table = results.ours
     panels: dict[tuple[str, str], list[Line]] = {}
-    one_method = len({method for _, method, _ in choices}) == 1
-    for group in _coinciding(choices, results.ours, alone=one_method):
+    has_one_method = len({method for _, method, _ in choices}) == 1
+    groups = [[choice] for choice in choices]
+    if not has_one_method:
+        groups = _coinciding(choices, table)
+    for group in groups:
         dataset, method, reference = group[0]
-        levels = results.ours.levels(dataset, method)
+        levels = table.levels(dataset, method)
         names = ", ".join(TITLES[method] for _, method, _ in group)
-        short = "Ali publ." if method == ALI_AS_PUBLISHED else TITLES[method]
+        if has_one_method:
+            label = reference
+            name = ""
+            look = REFERENCE_LOOKS[reference]
+        else:
+            label = _SHORT_TITLES.get(method, TITLES[method])
+            name = f"{names} {reference}"
+            look = METHOD_LOOKS[method]
         for metric in METRICS:
+            summaries = [
+                table.summary(dataset, level, method, reference, metric)
+                for level in levels
+            ]
             line = Line(
-                label=reference if one_method else short,
-                name="" if one_method else f"{names} {reference}",
-                look=REFERENCE_LOOKS[reference]
-                if one_method
-                else METHOD_LOOKS[method],
+                label=label,
+                name=name,
+                look=look,
                 levels=tuple(level for level in levels if level is not None),
-                summaries=tuple(
-                    results.ours.summary(
-                        dataset, level, method, reference, metric
-                    )
-                    for level in levels
-                ),
+                summaries=tuple(summaries),
             )
             panels.setdefault((dataset, metric), []).append(line)
     return paper_figures.draw_errors(title, note, panels, stem)
 
 
-def _coinciding(
-    choices: Sequence[Choice], table: Table, alone: bool
-) -> list[list[Choice]]:
-    """Choices whose errors are the same at every level (Park and Taylor): one line is drawn for all
-    of a group. ``alone``: each is a group.
+def _coinciding(choices: Sequence[Choice], table: Table) -> list[list[Choice]]:
+    """Group the choices whose errors are equal at every level, such as Park and Taylor.
+
+    A group gets a single line in the figure.
     """
-    groups: list[tuple[list[Choice], str, pd.Series]] = []
+    groups: list[list[Choice]] = []
+    centres_of_groups: list[pd.Series] = []
     for choice in choices:
+        dataset, _, _ = choice
         centres = _numbers([choice], table)["centre"]
-        for group, dataset, other in groups:
-            if (
-                not alone
-                and dataset == choice[0]
-                and np.allclose(centres, other, 1e-6, 1e-6)
-            ):
+        for group, other in zip(groups, centres_of_groups, strict=True):
+            is_same_dataset = group[0][0] == dataset
+            if is_same_dataset and np.allclose(centres, other, 1e-6, 1e-6):
                 group.append(choice)
                 break
         else:
-            groups.append(([choice], choice[0], centres))
-    return [group for group, _, _ in groups]
+            groups.append([choice])
+            centres_of_groups.append(centres)
+    return groups
 
 
 def _compare(
@@ -191,29 +205,30 @@ def _compare(
     choices: Sequence[Choice],
     results: Results,
 ) -> list[Path]:
+    """Write the comparison of plotted points with the published results; return the paths."""
     compared = numbers.copy()
     theirs = _numbers(choices, results.theirs)
-    parts = ["centre", "low", "high"]
-    published = [f"published_{statistic}" for statistic in parts]
-    compared[published] = theirs[parts]
-    compared["agrees"] = agree(
-        numbers[parts].to_numpy(), theirs[parts].to_numpy()
-    ).all(axis=1)
-    rows = dict(list(results.rows.groupby(["dataset", "method", "reference"])))
+    statistics = ["centre", "low", "high"]
+    published = [f"published_{statistic}" for statistic in statistics]
+    compared[published] = theirs[statistics]
+    are_same = agree(
+        numbers[statistics].to_numpy(), theirs[statistics].to_numpy()
+    )
+    compared["agrees"] = are_same.all(axis=1)
+    line_keys = ["dataset", "method", "reference"]
+    rows_of_lines = dict(list(results.rows.groupby(line_keys)))
     whys = []
     for point in compared.itertuples():
-        some = rows[point.dataset, point.method, point.reference]
-        some = some[some["level"].eq(point.level) | some["level"].isna()]
-        whys.append("" if point.agrees else comparison.reasons(some))
+        rows = rows_of_lines[point.dataset, point.method, point.reference]
+        is_of_point = rows["level"].eq(point.level) | rows["level"].isna()
+        rows = rows[is_of_point]
+        whys.append("" if point.agrees else comparison.reasons(rows))
     others = compared[~compared["agrees"]]
-    inside = (
-        others["centre"]
-        .between(others["published_low"], others["published_high"])
-        .sum()
+    is_inside = others["centre"].between(
+        others["published_low"], others["published_high"]
     )
-    keys = pd.MultiIndex.from_frame(
-        results.rows[["dataset", "method", "reference"]]
-    )
+    inside = is_inside.sum()
+    keys = pd.MultiIndex.from_frame(results.rows[line_keys])
     shown = results.rows[keys.isin(pd.MultiIndex.from_tuples(choices))]
     return [
         write_csv(
@@ -235,8 +250,9 @@ def _compare(
 
 
 def write_components(name: str, results: Results) -> list[Path]:
-    """Figure 4: the absolute components of the parent's relative motions on the drives without
-    noise; returns the paths.
+    """Write Figure 4: absolute components of the parent's relative motions, without noise.
+
+    Returns the paths of the files.
     """
     summaries = components(results.source.cases("noise", 0.0))
     number, where = _where("4", results)
@@ -256,8 +272,8 @@ def write_components(name: str, results: Results) -> list[Path]:
     return [
         *paper_figures.draw_components(
             f"{number}. Components of the relative motions of {where} without noise",
-            "Median, quartiles, whiskers to 1.5 interquartile ranges. Of the parent sensor; "
-            "angles are ZYX Euler angles.",
+            "Median, quartiles, whiskers to 1.5 interquartile ranges. Motions of the parent "
+            "sensor; angles are ZYX Euler angles.",
             {
                 f"|{component}|": summaries[component]
                 for component in _COMPONENTS
@@ -269,8 +285,9 @@ def write_components(name: str, results: Results) -> list[Path]:
 
 
 def components(cases: Sequence[Case]) -> dict[str, dict[str, Summary]]:
-    """Summaries of the absolute components (m, deg) of all relative motions, by component and
-    reference.
+    """Return summaries of the absolute components (m, deg) of all relative motions.
+
+    The keys are the component and the reference.
     """
     summaries: dict[str, dict[str, Summary]] = {
         component: {} for component in _COMPONENTS
@@ -279,10 +296,11 @@ def components(cases: Sequence[Case]) -> dict[str, dict[str, Summary]]:
         motions = np.concatenate(
             [case.pairs(reference).Ts_parenti_parentj for case in cases]
         )
-        angles = Rotation.from_matrix(motions[:, :3, :3]).as_euler(
-            "ZYX", degrees=True
-        )[:, ::-1]
-        values = np.abs(np.hstack([motions[:, :3, 3], angles])).T
+        rotations = Rotation.from_matrix(motions[:, :3, :3])
+        yaw_pitch_roll = rotations.as_euler("ZYX", degrees=True)
+        roll_pitch_yaw = yaw_pitch_roll[:, ::-1]
+        translations = motions[:, :3, 3]
+        values = np.abs(np.hstack([translations, roll_pitch_yaw])).T
         for component, of_component in zip(_COMPONENTS, values, strict=True):
             summaries[component][reference] = quartile_summary(of_component)
     return summaries

@@ -1,4 +1,4 @@
-"""What our run shows about the published results: agreement, false minima, Ali, DNLO."""
+"""Our run against the published results: agreement of rows, DNLO, Ali, Zhuang's false minima."""
 
 from pathlib import Path
 
@@ -11,11 +11,12 @@ from reproduction.results import Results, Table
 from reproduction.rows import ALI_AS_PUBLISHED
 from reproduction.writing import markdown_table, percent, write_text
 
+# An answer whose rotation error exceeds this (deg) is a false minimum.
 _WRONG_DEG = 90.0
 
 
 def write(name: str, results: Results) -> list[Path]:
-    """Write ``NAME.md`` and rows.csv; returns the paths."""
+    """Write ``NAME.md`` and rows.csv, and return their paths."""
     rows = results.rows
     paired = rows[(rows["method"] != "ali") | rows["dataset"].isin(KITTI)]
     return [
@@ -36,20 +37,12 @@ def write(name: str, results: Results) -> list[Path]:
 
 
 def _ali(table: Table) -> str:
-    methods = {"published": ALI_AS_PUBLISHED, "proper": "ali", "DNL": "dnl"}
+    """Return tables of median errors of both variants of Ali, and of DNL, at the largest noise."""
     blocks = []
     for dataset in SIMULATED:
         level = LEVELS[dataset][-1]
         lines = [
-            {"reference": reference}
-            | {
-                f"{metric}, {title}": f"{np.median(values):.4g}"
-                for metric in ("e_at", "e_aR")
-                for title, method in methods.items()
-                for values in [
-                    table.values(dataset, level, method, reference, metric)
-                ]
-            }
+            _medians(table, dataset, level, reference)
             for reference in REFERENCES
         ]
         where = "mixture" if level is None else f"{dataset} at {level:g}"
@@ -57,16 +50,30 @@ def _ali(table: Table) -> str:
     return "\n\n".join(blocks)
 
 
+def _medians(
+    table: Table, dataset: str, level: float | None, reference: str
+) -> dict[str, str]:
+    methods = {"published": ALI_AS_PUBLISHED, "proper": "ali", "DNL": "dnl"}
+    line = {"reference": reference}
+    for metric in ("e_at", "e_aR"):
+        for title, method in methods.items():
+            values = table.values(dataset, level, method, reference, metric)
+            line[f"{metric}, {title}"] = f"{np.median(values):.4g}"
+    return line
+
+
 def _zhuang(rows: pd.DataFrame) -> str:
-    chosen = rows[
-        (rows["method"] == "zhuang") & rows["dataset"].isin(SIMULATED)
-    ]
-    wrong = chosen[chosen["published_e_aR"] > _WRONG_DEG]
-    free = wrong[wrong["level"] == 0.0]
+    """Return the text about published false minima of Zhuang's method."""
+    is_simulated = rows["dataset"].isin(SIMULATED)
+    simulated = rows[(rows["method"] == "zhuang") & is_simulated]
+    wrong = simulated[simulated["published_e_aR"] > _WRONG_DEG]
+    noise_free = wrong[wrong["level"] == 0.0]
+    runs = ", ".join(sorted(set(noise_free["run"])))
+    n_unconverged = (~simulated["converged"].astype(bool)).sum()
     return (
         f"The published answer is more than {_WRONG_DEG:.0f} deg wrong in "
-        f"{percent(len(wrong), len(chosen))} simulated rows, {len(free)} of them without any noise "
-        f"({', '.join(sorted(set(free['run'])))}). Zhuang's parameters, the axis times the "
+        f"{percent(len(wrong), len(simulated))} simulated rows. {len(noise_free)} of these rows "
+        f"have no noise ({runs}). Zhuang's parameters, the axis times the "
         "tangent of half the angle, grow without bound near 180 deg. Our iteration does the same "
-        f"steps, and has not converged in {(~chosen['converged'].astype(bool)).sum()} rows."
+        f"steps, and has not converged in {n_unconverged} rows."
     )

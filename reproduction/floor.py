@@ -1,8 +1,9 @@
-"""``python -m reproduction.floor --data-folder DIR``: is the common-mode floor as wide as it should
-be on rigs that it was not chosen on?
+"""``python -m reproduction.floor --data-folder DIR``: test the sizes of the common-mode floor.
 
-Its sizes are chosen by likelihood on all families of real recordings but one, each family for as
-much as any other, and judged on that one. Pieces of recordings are drawn anew at every run.
+The common-mode floor is the part of sigma for errors that are the same in every recording. For each
+family of real recordings, the sizes of the floor are chosen by likelihood on all other families,
+with equal weights. The coverage of the 90 % intervals is then measured on the family itself. Pieces
+of recordings are drawn anew at every run.
 """
 
 from collections.abc import Iterator
@@ -17,12 +18,12 @@ from hand_eye_calib.core.assessment.common_mode import (
 )
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.coverage.scores import answer
 from reproduction.gate.cases import Case, real_cases
 from reproduction.writing import markdown_table, seed_of, show, study_parser
 
-_REACH = 1.645
-# Errors beyond so many standard deviations say no more about a size.
+# Errors in standard deviations are limited to this value, so that an outlier does not decide.
 _FARTHEST = 3.0
 
 # Sizes to choose from: translation (m), rotation (rad), and translation per speed (s).
@@ -34,8 +35,10 @@ _SIZES = (
 
 
 def axes(case: Case) -> Iterator[dict[str, object]]:
-    """Error and variances of the axes that are known and that the motion shows; ``rest`` is what is
-    in the floor besides its sizes.
+    """Yield the error and the variances of each axis that the truth and the motion determine.
+
+    The variances are: ``truth`` of the true value, ``stated`` without the floor, ``whole`` with the
+    floor, and ``rest`` of floor terms that do not depend on its sizes.
     """
     parent = case.streams[0]
     result = answer(*case.streams, case.options)
@@ -63,7 +66,7 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
 def _variances(
     axis_rows: pd.DataFrame, sizes: tuple[float, float, float]
 ) -> FloatArray:
-    """Stated variances with a floor of these sizes."""
+    """Return the variances of the axes with a floor of these sizes (m, rad, s)."""
     translation, rotation, travel_s = sizes
     of_speed = translation**2 + (travel_s * axis_rows["speed"]) ** 2
     fixed = np.where(axis_rows["turns"], rotation**2, of_speed)
@@ -71,14 +74,17 @@ def _variances(
 
 
 def chosen(axis_rows: pd.DataFrame) -> tuple[float, float, float]:
-    """The likeliest sizes of the floor."""
+    """Return the most likely sizes of the floor, among :data:`_SIZES`.
+
+    The loss is the negative log likelihood of normal errors, as a mean over families.
+    """
 
     def loss(sizes: tuple[float, float, float]) -> float:
         variances = _variances(axis_rows, sizes) + axis_rows["truth"]
-        far = np.minimum(axis_rows["error"] ** 2 / variances, _FARTHEST**2)
-        return float(
-            (np.log(variances) + far).groupby(axis_rows["family"]).mean().mean()
-        )
+        squares = axis_rows["error"] ** 2 / variances
+        losses = np.log(variances) + np.minimum(squares, _FARTHEST**2)
+        of_families = losses.groupby(axis_rows["family"]).mean()
+        return float(of_families.mean())
 
     return min(product(*_SIZES), key=loss)
 
@@ -86,28 +92,29 @@ def chosen(axis_rows: pd.DataFrame) -> tuple[float, float, float]:
 def _row(
     name: str, axis_rows: pd.DataFrame, sizes: str = ""
 ) -> dict[str, object]:
-    far = np.abs(axis_rows["error"])
+    """Return the row of a family; coverage is with and without the variance of the truth."""
+    absolute = np.abs(axis_rows["error"])
+    truth = axis_rows["truth"]
     row: dict[str, object] = {
         "Family": name,
         "Axes": len(axis_rows),
         "Chosen without it": sizes,
     }
-    for title, of in (
-        ("Covers then", "then"),
-        ("As it is", "whole"),
-        ("No floor", "stated"),
-    ):
-        inside = [
-            far < _REACH * np.sqrt(axis_rows[of] + more)
-            for more in (axis_rows["truth"], 0.0)
-        ]
-        row[title] = ", ".join(
-            f"{100 * np.mean(shares):.0f} %" for shares in inside
+    columns = {
+        "Covers then": "then",
+        "As it is": "whole",
+        "No floor": "stated",
+    }
+    for title, column in columns.items():
+        variances = axis_rows[column]
+        with_truth = absolute < HALF_WIDTH_90 * np.sqrt(variances + truth)
+        without_truth = absolute < HALF_WIDTH_90 * np.sqrt(variances)
+        row[title] = (
+            f"{100 * np.mean(with_truth):.0f} %, {100 * np.mean(without_truth):.0f} %"
         )
-    floor = np.sqrt(axis_rows["whole"] - axis_rows["stated"])[
-        ~axis_rows["turns"]
-    ]
-    largest = (far / np.sqrt(axis_rows["whole"] + axis_rows["truth"])).max()
+    floor_sigmas = np.sqrt(axis_rows["whole"] - axis_rows["stated"])
+    floor = floor_sigmas[~axis_rows["turns"]]
+    largest = (absolute / np.sqrt(axis_rows["whole"] + truth)).max()
     return row | {
         "Mean floor (mm)": f"{1e3 * floor.mean():.1f}",
         "Largest z": f"{largest:.1f}",
@@ -115,11 +122,15 @@ def _row(
 
 
 def table(axis_rows: pd.DataFrame) -> str:
-    """A row for every family, its floor chosen on the others; and one for all."""
+    """Return a table with a row for each family and a last row for all families.
+
+    Column ``then`` of the rows gets the variances with the floor chosen on the other families.
+    """
     rows = []
     for family in axis_rows["family"].unique():
         is_left_out = axis_rows["family"] == family
-        metres, radians, travel_s = sizes = chosen(axis_rows[~is_left_out])
+        sizes = chosen(axis_rows[~is_left_out])
+        metres, radians, travel_s = sizes
         axis_rows.loc[is_left_out, "then"] = _variances(
             axis_rows[is_left_out], sizes
         )
@@ -129,20 +140,22 @@ def table(axis_rows: pd.DataFrame) -> str:
 
 
 def main() -> None:
-    """Draw, solve and print."""
+    """Draw pieces of recordings, calibrate them, and print the table."""
     parser = study_parser("reproduction.floor", __doc__)
     parser.add_argument(
-        "--pieces", type=int, default=6, help="of each recording. Default: 6"
+        "--pieces",
+        type=int,
+        default=6,
+        help="pieces of each recording. Default: 6",
     )
     arguments = parser.parse_args()
     folder = arguments.data_folder or parser.error(
         "name the recordings with --data-folder"
     )
     seed = seed_of(None)
-    asked = ("time_offset", "scale", "prior")
-    cases = real_cases(
-        folder, arguments.pieces, np.random.default_rng(seed), asked
-    )
+    option_names = ("time_offset", "scale", "prior")
+    rng = np.random.default_rng(seed)
+    cases = real_cases(folder, arguments.pieces, rng, option_names)
     axis_rows = pd.DataFrame([row for case in cases for row in axes(case)])
     show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(axis_rows)}"})
 

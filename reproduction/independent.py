@@ -1,8 +1,8 @@
-"""Our figures beside those that others published, on their recordings and by their protocols.
+"""Our results beside the published results of others, on their recordings, by their protocols.
 
-``python -m reproduction.independent --data-folder DIR [--page PAGE]``: DIR holds the recordings
-(``independent/`` and the arm of ``asl_robot_arm/``). Samples of long recordings are drawn anew at
-each run.
+``python -m reproduction.independent --data-folder DIR [--page PAGE]``: DIR contains the recordings
+(``independent/``, and ``asl_robot_arm/`` with the arm). Segments of long recordings are drawn anew
+at every run.
 """
 
 import hashlib
@@ -10,7 +10,7 @@ import random
 import re
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,22 +25,25 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.stops.closed_form import Stops
 from hand_eye_calib.extras.stops.robot_world import RobotWorld, solve
 from hand_eye_calib.extras.stops.samples import read_arm_samples
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.recordings import between
-from reproduction.writing import markdown_table, show, study_parser
+from reproduction.writing import counted, markdown_table, show, study_parser
 
-# Pairs of the arm's poses: hand and camera within this (s).
+# Largest time (s) between the stamps of hand and camera at a stop of the arm.
 _WITHIN_S = 0.011
 
-# The first characters of the digests of the names of the stops that the five splits fit.
+# The five published splits of the arm: the first characters of the SHA-256 digest of the names of
+# their fitted stops. A split with another digest is not the published split.
 _DIGESTS = ("78a5cd77", "f8a9c316", "b028e440", "0aaad5b3", "cb8a6787")
 
-# Stops of a camera and a tag that say where the camera is.
+# Fewest stops of a camera and a tag for an estimate of the camera's pose.
 _MIN_STOPS = 20
 
-# Mount of Shrimp as measured by hand: translation (m), rotation vector (rad). Errors that its
-# authors published, by length in s: x, y, z in m, about x, y, z in degrees.
+# Mount of Shrimp as measured by hand: translation (m), rotation vector (rad).
 _SHRIMP = np.r_[-0.0320, -0.0048, 0.8822, 0.01358, 0.00200, -3.11428]
+# Factors from m and rad to m and deg.
 _SHRIMP_UNITS = np.repeat([1.0, 180.0 / np.pi], 3)
+# Published mean errors by the length of the segments (s): x, y, z (m), about x, y, z (deg).
 _SHRIMP_PUBLISHED = {
     50: (0.082, 0.054, 0.112, 0.304, 0.459, 1.128),
     100: (0.072, 0.035, 0.101, 0.288, 0.384, 1.076),
@@ -50,7 +53,7 @@ _SHRIMP_PUBLISHED = {
 
 @dataclass(frozen=True)
 class Row:
-    """A figure of ours beside the best that was published."""
+    """A value that we measured, and the best published value."""
 
     recording: str
     figure: str
@@ -60,7 +63,7 @@ class Row:
 
 
 def digest(path: Path) -> str:
-    """Start of the SHA-256 of a file."""
+    """Return the first characters of the SHA-256 digest of a file."""
     content = path.read_bytes()
     return hashlib.sha256(content).hexdigest()[:12]
 
@@ -68,7 +71,10 @@ def digest(path: Path) -> str:
 def closure(
     Ts_a: FloatArray, X: FloatArray, Z: FloatArray, Ts_b: FloatArray
 ) -> tuple[float, float]:
-    """Root mean squares of the angles (deg) and distances (mm) between ``A X`` and ``Z B``."""
+    """Return the root mean square angle (deg) and distance (mm) between ``A X`` and ``Z B``.
+
+    ``Ts_a`` and ``Ts_b`` are the stacks A and B (K, 4, 4); X and Z are (4, 4).
+    """
     from_left = Ts_a @ X
     from_right = Z @ Ts_b
     turns = se3.relative_rotations(
@@ -85,7 +91,7 @@ def closure(
 def closure_of_motions(
     X: FloatArray, Ts_a: FloatArray, Ts_b: FloatArray
 ) -> tuple[float, float]:
-    """The closure of A X = X B over the motions between all pairs of poses, later to earlier."""
+    """Return the closure of A X = X B for the motions between all pairs of poses."""
     later, earlier = np.triu_indices(len(Ts_a), 1)[::-1]
     motions_a = se3.inverse(Ts_a[later]) @ Ts_a[earlier]
     motions_b = se3.inverse(Ts_b[later]) @ Ts_b[earlier]
@@ -93,6 +99,7 @@ def closure_of_motions(
 
 
 def _matrices(path: Path) -> FloatArray:
+    """Read poses (N, 4, 4) from a CSV file with the columns t, x, y, z, qx, qy, qz, qw."""
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
     quats = rows[:, 4:8]
     quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
@@ -101,7 +108,7 @@ def _matrices(path: Path) -> FloatArray:
 
 @dataclass(frozen=True, order=True)
 class _Stop:
-    """Rows of a stop in the files of hand and camera."""
+    """A stop: its name, and its rows in the files of hand and camera."""
 
     name: str
     hand: int
@@ -109,9 +116,10 @@ class _Stop:
 
 
 def _nearest_stops(hand_s: FloatArray, eye_s: FloatArray) -> list[_Stop]:
-    """Pair stamps (s) of the camera with the nearest of the hand; keep the closest of each hand.
+    """Pair every stamp (s) of the camera with the nearest stamp of the hand.
 
-    Stops are ordered by name, as in the published splits.
+    A stamp of the hand is used once, with its closest stamp of the camera. Stops are sorted by
+    name, as in the published splits.
     """
     best: dict[int, tuple[float, int]] = {}
     for row, stamp_s in enumerate(eye_s):
@@ -128,7 +136,7 @@ def _nearest_stops(hand_s: FloatArray, eye_s: FloatArray) -> list[_Stop]:
 
 
 def ethz(folder: Path) -> Iterator[Row]:
-    """Thirty-two stops of an arm, judged on sixteen others; five splits."""
+    """Calibrate with 32 stops of an arm and test on 16 other stops, for five splits."""
     names = "base_link_sr300_hinge.csv", "target_ir.csv"
     start = "robot_arm_complete_bag_color_and_ir"
     files = [folder / "asl_robot_arm" / f"{start}_{name}" for name in names]
@@ -174,7 +182,7 @@ def ethz(folder: Path) -> Iterator[Row]:
 
 
 def camodocal(folder: Path) -> Iterator[Row]:
-    """The example of handeye_calib_camodocal: motions between neighbours."""
+    """Calibrate the example of handeye_calib_camodocal: motions between neighbouring stops."""
     path = (
         folder / "independent" / "camodocal_example" / "TransformPairsInput.yml"
     )
@@ -192,7 +200,7 @@ def camodocal(folder: Path) -> Iterator[Row]:
 
 
 def moveit(folder: Path) -> Iterator[Row]:
-    """The samples of MoveIt's tests, eye to hand: the camera in the robot's base."""
+    """Calibrate the samples of MoveIt's tests: a fixed camera, in the frame of the robot's base."""
     path = folder / "independent" / "moveit_samples" / "pose_samples.json"
     samples = read_arm_samples(path)
     fit = solve(Stops(samples.robot, samples.tracking))
@@ -210,10 +218,10 @@ def moveit(folder: Path) -> Iterator[Row]:
 def _chi_square_per_degree(
     Zs: FloatArray, weights: FloatArray, covariance: FloatArray
 ) -> float:
-    """Chi-square of poses (K, 4, 4) about their weighted mean, per degree of freedom.
+    """Return chi-square of poses (K, 4, 4) about their weighted mean, per degree of freedom.
 
-    ``weights`` (K, 6, 6) are the inverse covariances of the poses, ``covariance`` (6, 6) that of
-    the mean.
+    ``weights`` (K, 6, 6) are the inverse covariances of the poses. ``covariance`` (6, 6) is the
+    covariance of the mean.
     """
     errors = se3.log(se3.inverse(Zs[0]) @ Zs)
     errors -= covariance @ np.einsum("kij,kj->i", weights, errors)
@@ -223,7 +231,7 @@ def _chi_square_per_degree(
 
 
 def wise(folder: Path) -> Iterator[Row]:
-    """Eight cameras that see sixteen tags: Z of a camera from each of its tags."""
+    """Calibrate eight cameras that observe sixteen tags: pose Z of each camera, from each tag."""
     files = sorted((folder / "independent" / "wise_8_cameras").glob("*_A.csv"))
     fits_of_camera: dict[int, list[RobotWorld]] = defaultdict(list)
     n_stops = 0
@@ -264,13 +272,14 @@ def wise(folder: Path) -> Iterator[Row]:
 
 
 def _poses_wxyz(path: Path) -> FloatArray:
+    """Read poses (N, 4, 4) from a CSV file with the columns qw, qx, qy, qz, x, y, z."""
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
     quats_xyzw = np.roll(rows[:, :4], -1, axis=1)
     return np.asarray(se3.from_quat_xyzw(rows[:, 4:7], quats_xyzw))
 
 
 def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
-    """Navigation system and lidar of the farm robot."""
+    """Read the trajectories of the farm robot's navigation system and lidar."""
     files = folder / "independent" / "shrimp"
     return tuple(
         _shrimp_trajectory(
@@ -281,7 +290,7 @@ def shrimp_sensors(folder: Path) -> tuple[hec.Trajectory, ...]:
 
 
 def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
-    """Random segments of a farm robot's drive, as long as those of Taylor and Nieto."""
+    """Calibrate random segments of a farm robot's drive, as long as those of Taylor and Nieto."""
     nav, velodyne = shrimp_sensors(folder)
     truth = np.eye(4)
     truth[:3, 3] = _SHRIMP[:3]
@@ -294,47 +303,47 @@ def shrimp(folder: Path, n_segments: int) -> Iterator[Row]:
         errors = []
         stated = []
         verdicts = []
+        stated_measured = []
         for _ in range(n_segments):
-            first = generator.integers(start_ns, end_ns - seconds * 10**9)
-            pair = (
-                between(stream, first, first + seconds * 10**9)
-                for stream in (nav, velodyne)
-            )
-            result = hec.calibrate(*pair)
+            length_ns = seconds * 10**9
+            first_ns = generator.integers(start_ns, end_ns - length_ns)
+            last_ns = first_ns + length_ns
+            parent = between(nav, first_ns, last_ns)
+            child = between(velodyne, first_ns, last_ns)
+            result = hec.calibrate(parent, child)
             relative = se3.inverse(truth) @ result.T_parent_child
-            errors.append(
-                np.r_[
-                    relative[:3, 3],
-                    np.degrees(se3.rotation_log(relative[:3, :3])),
-                ]
-            )
-            covariances = np.array(
-                [result.covariance, result.covariance_measured]
-            )
-            stated.append(
-                _SHRIMP_UNITS * np.sqrt(np.diagonal(covariances, 0, 1, 2))
-            )
+            rotation_error = se3.rotation_log(relative[:3, :3])
+            errors.append(np.r_[relative[:3, 3], np.degrees(rotation_error)])
+            sigmas = np.sqrt(np.diag(result.covariance))
+            sigmas_measured = np.sqrt(np.diag(result.covariance_measured))
+            stated.append(_SHRIMP_UNITS * sigmas)
+            stated_measured.append(_SHRIMP_UNITS * sigmas_measured)
             verdicts.append(result.verdict.value)
-        ours = " ".join(
-            f"{value:.3f}" for value in np.mean(np.abs(errors), axis=0)
+        # Errors against the truth are compared with whole sigmas, and the scatter of the segments
+        # with measured sigmas.
+        from_median = errors - np.median(errors, axis=0)
+        truth_cover = np.mean(np.abs(errors) < HALF_WIDTH_90 * np.array(stated))
+        scatter_cover = np.mean(
+            np.abs(from_median) < HALF_WIDTH_90 * np.array(stated_measured)
         )
-        off = np.abs(
-            np.stack([errors, errors - np.median(errors, axis=0)], axis=1)
-        )
-        covers = np.mean(off < 1.645 * np.array(stated), axis=(0, 2))
+        figure = f"mean errors, {n_segments} random segments of {seconds} s"
+        covers = f"truth {truth_cover:.0%}, scatter {scatter_cover:.0%}"
+        ours = _three_decimals(np.mean(np.abs(errors), axis=0))
         yield Row(
             "Shrimp",
-            f"mean errors, {n_segments} random segments of {seconds} s (x y z m, about x y z deg)",
-            f"{ours}; 90 % intervals: truth {covers[0]:.0%}, scatter {covers[1]:.0%}",
-            " ".join(f"{value:.3f}" for value in published),
-            ", ".join(
-                f"{verdicts.count(verdict)} {verdict}"
-                for verdict in sorted(set(verdicts))
-            ),
+            f"{figure} (x y z m, about x y z deg)",
+            f"{ours}; 90 % intervals: {covers}",
+            _three_decimals(published),
+            counted(verdicts),
         )
+
+
+def _three_decimals(values: Iterable[float]) -> str:
+    return " ".join(f"{value:.3f}" for value in values)
 
 
 def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
+    """Read a trajectory of Shrimp; the file contains the motion of every step, and its stamp."""
     data: Any = scipy.io.loadmat(path, squeeze_me=True, struct_as_record=False)[
         name
     ]
@@ -350,7 +359,7 @@ def _shrimp_trajectory(path: Path, name: str) -> hec.Trajectory:
 
 
 def ntu_viral(folder: Path) -> Iterator[Row]:
-    """Prism on a drone: three flights, and the flights against each other."""
+    """Calibrate a prism on a drone in three flights, and compare the flights with each other."""
     data = folder / "independent" / "ntu_viral"
     published = np.loadtxt(data / "trans_B2prism.csv", delimiter=",")
     text = " ".join(f"{value:.4f}" for value in published)
@@ -378,7 +387,7 @@ def ntu_viral(folder: Path) -> Iterator[Row]:
     mean = np.sum(weights * offsets, axis=0) / weights.sum(axis=0)
     deviations = np.stack(offsets) - mean
     chi2 = float(np.sum(weights * deviations**2)) / 6.0
-    figure = "chi-square between flights, per degree, without the floor that they share"
+    figure = "chi-square between flights, per degree of freedom, without the allowance"
     yield Row("NTU VIRAL", figure, f"{chi2:.2f}", "", "3 flights")
 
 
@@ -386,7 +395,10 @@ def main() -> None:
     """Measure all recordings, and print the table or put it into the page."""
     parser = study_parser("reproduction.independent", __doc__)
     parser.add_argument(
-        "--segments", type=int, default=20, help="of Shrimp, for each length"
+        "--segments",
+        type=int,
+        default=20,
+        help="segments of Shrimp, for each length",
     )
     arguments = parser.parse_args()
     folder = arguments.data_folder or parser.error(

@@ -23,13 +23,11 @@ from kinhec.pipeline import generate_dataset
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.writing import markdown_table, show, study_parser
 
 # Name of our results among those of KinHEC's solvers.
 _OURS = "hand_eye_calib"
-
-# Half-width of a 90 % interval of a normal error, in standard deviations (textbook).
-_INTERVAL_SIGMAS = 1.645
 
 # Start of KinHEC's clocks (s): our stamps must be positive.
 _START_S = 1e6
@@ -87,7 +85,7 @@ def score(result: hec.Calibration, truth: FloatArray) -> Score:
     errors = se3.deviation(result.T_parent_child, truth)
     metres = np.linalg.norm(errors[:3])
     radians = np.linalg.norm(errors[3:])
-    is_covered = np.abs(errors) < _INTERVAL_SIGMAS * result.sigmas_measured
+    is_covered = np.abs(errors) < HALF_WIDTH_90 * result.sigmas_measured
     return Score(
         rotation_deg=float(np.degrees(radians)),
         translation_mm=1e3 * float(metres),

@@ -41,7 +41,7 @@ _TOGETHER_S = 0.001
     unit="s gap",
 )
 def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
-    """Start anew in the middle, after a gap and in a world of its own."""
+    """Restart the child in the middle: a gap, then a new world that begins at its pose."""
     half = len(child) // 2
     poses = child.poses.copy()
     poses[half:] = se3.inverse(poses[half]) @ poses[half:]
@@ -61,7 +61,7 @@ def restarted(child: Trajectory, gap_s: float, _: Random) -> Trajectory:
 def smooth_parent(
     parent: Trajectory, child: Trajectory, tau_s: float, _: Random
 ) -> Streams:
-    """Low-passed and shifted back by the delay."""
+    """Low-pass the parent's orientations, and shift them back by the delay of the filter."""
     smooth = with_parts(parent, filtered_rotations(parent, tau_s))
     poses = delayed(smooth, -tau_s)
     return with_parts(parent, poses[:, :3, :3]), child
@@ -76,7 +76,7 @@ def smooth_parent(
 def remounted(
     parent: Trajectory, child: Trajectory, degrees: float, random: Random
 ) -> Streams:
-    """A minute apart, with another mount and other worlds in the second."""
+    """Make two recordings a minute apart; the second has another mount and other worlds."""
     remount = loosened(child, degrees, random)
     half_ns = child.stamps_ns[len(child) // 2]
     streams = []
@@ -99,9 +99,9 @@ def remounted(
 def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
     """A slow source published fast: each pose is repeated until there is a new one."""
     elapsed_s = seconds_of(child)
-    steps = (elapsed_s / interval_s).astype(int)
-    first = np.unique(steps, return_index=True)[1]
-    return posed(child, child.poses[first[steps]])
+    intervals = (elapsed_s / interval_s).astype(int)
+    first_of_interval = np.searchsorted(intervals, intervals)
+    return posed(child, child.poses[first_of_interval])
 
 
 @both(
@@ -114,7 +114,7 @@ def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
 def exchanged(
     parent: Trajectory, child: Trajectory, share: float, _: Random
 ) -> Streams:
-    """From a share of the recording on, each stream has the poses of the other sensor."""
+    """Exchange the poses of the two streams after a share of the recording."""
     from_ns = child.stamps_ns[int(share * len(child))]
     streams = []
     for first, second in ((parent, child), (child, parent)):
@@ -178,7 +178,7 @@ def jittered(child: Trajectory, sigma_s: float, random: Random) -> Trajectory:
     unit="deg",
 )
 def swinging(child: Trajectory, degrees: float, _: Random) -> Trajectory:
-    """About one axis, once in seven seconds."""
+    """Turn the child about its y axis, with a period of seven seconds."""
     phases = 2 * np.pi * seconds_of(child) / 7.0
     angles = np.radians(degrees) * np.sin(phases)
     swing = se3.rotation_exp(np.outer(angles, [0.0, 1.0, 0.0]))
@@ -205,7 +205,7 @@ def mirrored_world(child: Trajectory, axis: float, _: Random) -> Trajectory:
     unit="s",
 )
 def stuck(child: Trajectory, seconds: float, _: Random) -> Trajectory:
-    """It goes on where it is then."""
+    """Repeat one pose for some seconds; the true poses follow."""
     first = len(child) // 2
     since_ns = child.stamps_ns - child.stamps_ns[first]
     is_stuck = (since_ns >= 0) & (since_ns < seconds * 1e9)
@@ -238,7 +238,7 @@ def few_digits(child: Trajectory, digits: float, _: Random) -> Trajectory:
     unit="m",
 )
 def relocalised(child: Trajectory, metres: float, random: Random) -> Trajectory:
-    """The child's world jumps by so much, and by as many tenths of a radian."""
+    """Let the child's world jump at intervals: ``metres``, and 0.1 rad per metre, per axis."""
     elapsed_s = seconds_of(child)
     poses = child.poses.copy()
     sizes = metres * np.repeat([1.0, 0.1], 3)
@@ -270,7 +270,7 @@ def republished(child: Trajectory, late_s: float, _: Random) -> Trajectory:
     unit="ppm",
 )
 def fast_clock(child: Trajectory, ppm: float, _: Random) -> Trajectory:
-    """It is right half-way."""
+    """Let the child's clock run too fast; it is correct in the middle of the recording."""
     middle_ns = child.stamps_ns[len(child) // 2]
     since_ns = child.stamps_ns - middle_ns
     late_ns = np.round(1e-6 * ppm * since_ns).astype(np.int64)
@@ -286,7 +286,7 @@ def fast_clock(child: Trajectory, ppm: float, _: Random) -> Trajectory:
 def heightless(
     parent: Trajectory, child: Trajectory, which: float, _: Random
 ) -> Streams:
-    """The parent's, those of both, and both upright besides."""
+    """Set heights to zero: the parent's (0), both (1), or both without roll and pitch (2)."""
     flat_parent = higher(parent, 0.0)
     flat_child = higher(child, 0.0)
     if which == 0.0:
@@ -303,7 +303,7 @@ def heightless(
     unit="s",
 )
 def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
-    """The poses are held back, come together, and have stamps of when they came."""
+    """Stamp the poses with their arrival: those of an interval arrive together at its end."""
     start_ns = child.stamps_ns[0]
     interval_ns = round(seconds * 1e9)
     bursts = (child.stamps_ns - start_ns) // interval_ns
@@ -373,5 +373,5 @@ child_alone(
 
 
 LATER = group("UVW")
-# Faults that were silent before the check estimated columns for them.
+# Faults without a finding before the check estimated a parameter for them.
 SILENT = group("X")

@@ -1,4 +1,12 @@
-"""Simulated machines with wheels and a sensor, and their true parameters."""
+"""Simulated machines with wheels and a sensor, and their true parameters.
+
+Machines are kinds of wheel data: ``wheels``, ``steering``, ``tricycle`` and ``omni``. ``mecanum``
+is the odometry of four mecanum wheels. No model describes the data of ``skid``, whose tracks slip
+more in tight curves, and of ``articulated``, whose steering angle is the angle of its joint.
+
+The courses ``eights`` and ``wide`` (figures of eight) determine x, y and yaw of the sensor.
+``straight``, ``circle``, ``bend``, ``left`` and ``spin`` do not.
+"""
 
 from typing import NamedTuple
 
@@ -59,27 +67,13 @@ class Course(NamedTuple):
     yaw_rate: FloatArray
 
 
-#: Courses of a machine. Only figures of eight, tight or wide, determine x, y and yaw.
-COURSES = ("eights", "wide", "straight", "circle", "bend", "left", "spin")
-
-#: Kinds of wheel data of the machines, and further machines: ``mecanum`` has the odometry of four
-#: mecanum wheels. Two have data that no model describes: ``skid`` has tracks that slip more in
-#: tight curves, and ``articulated`` has the angle of its joint as steering angle.
-MACHINES = (
-    "wheels",
-    "steering",
-    "tricycle",
-    "omni",
-    "mecanum",
-    "skid",
-    "articulated",
-)
+# Kind of the wheel data of machines whose name is not a kind of wheel data.
 _DATA = {"mecanum": "omni", "skid": "wheels", "articulated": "steering"}
 
 # Sum of half the wheelbase and half the track of a machine with mecanum wheels (m).
 _MECANUM_M = 0.6
-# Signs of the motions of its wheels (front left, front right, rear left, rear right) in four times
-# its motion (forward, left, turn).
+# Rows: motions forward, to the left, and turn. Columns: wheels front left, front right, rear left,
+# rear right. The speed of a wheel is the sum of the motions with the signs of its column.
 _MECANUM = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
 
@@ -92,10 +86,10 @@ def simulate_machine(
     slip: float = 1.0,
     ramp_rad: float = 0.0,
 ) -> Machine:
-    """Simulate a drive with slip, bumps and a noisy sensor.
+    """Simulate a drive with slip, bumps and a noisy sensor; see the module for the names.
 
     ``noise`` is a factor of all errors, ``slip`` of the number of slips of the wheels. The floor
-    rises and falls along the path by ``ramp_rad``.
+    rises and falls along the path with slopes up to ``ramp_rad``.
     """
     rng = np.random.default_rng(seed)
     times_s = np.arange(0.0, duration_s + 1.0, _STEP_S, dtype=float)
@@ -220,7 +214,7 @@ def _slip_of_wheels(
     slipping_s: float,
     n_wheels: int,
 ) -> FloatArray:
-    """Return the share (N, n_wheels) by which wheels turn too fast: bursts in curves."""
+    """Return the slip (N, n_wheels): the share by which wheels turn too fast, in some curves."""
     n_rows = len(yaw_rate)
     slip = np.zeros((n_rows, n_wheels))
     least_rate = 0.3 * np.abs(yaw_rate).max()

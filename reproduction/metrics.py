@@ -28,7 +28,7 @@ def errors(
     T_parent_child: FloatArray,
     truth_T_parent_child: FloatArray,
 ) -> Errors:
-    """All four metrics of a calibration."""
+    """Return all four metrics of a calibration."""
     return Errors(
         *relative_errors(pairs, T_parent_child),
         *absolute_errors(T_parent_child, truth_T_parent_child),
@@ -38,7 +38,10 @@ def errors(
 def relative_errors(
     pairs: MotionPairs, T_parent_child: FloatArray
 ) -> tuple[float, float]:
-    """Mean relative errors e_rt (m) and e_rR (rad), eqs 6 and 7, over at least one motion pair."""
+    """Return the mean relative errors e_rt (m) and e_rR (rad) of motion pairs, eqs 6 and 7.
+
+    There must be at least one motion pair.
+    """
     translation, rotation = pairs.residuals(T_parent_child)
     return (
         float(np.linalg.norm(translation, axis=1).mean()),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from reproduction.results import Summary
 
-# Okabe, Ito 2008, without the yellow that vanishes on white.
+# Colours of Okabe and Ito 2008, without yellow, which is hardly visible on white.
 _BLACK = "#000000"
 _SKY = "#56B4E9"
 _GREEN = "#009E73"
@@ -74,8 +74,8 @@ _DATASET_TITLES = {
     "drift": ("(c) drift", "rate (m/m)"),
     "mixture": ("(d) mixed noise", ""),
 }
-# Below a power of ten, at least this, the axis is linear, above logarithmic: errors span five
-# decades and some are zero.
+# The axis is linear below a power of ten and logarithmic above it: errors span five decades, and
+# some are zero. The smallest error above this value (m, deg) determines the power of ten.
 _LINEAR_BELOW = {"e_rt": 1e-3, "e_rR": 1e-2, "e_at": 1e-3, "e_aR": 1e-2}
 
 # Errors (m or deg) below this are rounding.
@@ -109,7 +109,7 @@ _LEGEND: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Line:
-    """One reference or method in a panel."""
+    """Line or box of a reference or method in a panel."""
 
     # Short name beside the line.
     label: str
@@ -117,9 +117,9 @@ class Line:
     name: str
     # Colour, marker, dashes.
     look: tuple[str, str, str]
-    # Empty in a box plot.
+    # Levels of noise; empty in a box plot.
     levels: tuple[float, ...]
-    # One per level; one in a box plot.
+    # A summary for each level; a single summary in a box plot.
     summaries: tuple[Summary, ...]
 
 

@@ -1,8 +1,8 @@
-"""Positions, rates or rotations alone with faults made on purpose, on simulated machines.
+"""Deliberate faults of streams of positions, rates or rotations alone, on simulated machines.
 
 ``python -m reproduction.part_faults positions --seeds 3`` prints a row for each fault: how often a
-finding names it, verdicts, and results beyond 3.3 standard deviations (with the allowance) that may
-be used.
+finding names the fault, the verdicts, and the number of USE results with an error above 3.3
+standard deviations (with the allowance).
 """
 
 import argparse
@@ -23,29 +23,35 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction import fault_counts
 from reproduction.coverage.classes import stamps_ns
-from reproduction.platforms import PLATFORMS
-from reproduction.writing import markdown_table, study_parser
+from reproduction.platforms import PLATFORMS, TARGETS, generators_of
+from reproduction.writing import (
+    add_seed_options,
+    markdown_table,
+    seeds_of,
+    study_parser,
+)
 
-# Paths and rates are made at this rate (Hz) before a sensor takes its samples.
+# Rate (Hz) of the simulated paths and angular rates before a sensor samples them.
 _FINE_HZ = 200.0
 
-# Targets for which verdicts do not depend on the accuracy: m, rad.
+# Targets (m, rad) so wide that verdicts do not depend on the accuracy.
 WIDE: Mapping[str, Any] = {"target_translation": 0.3, "target_rotation": 0.0175}
 
-# A consumer gyroscope: bias (rad/s), noise of a sample (rad/s), walk of the bias (rad/s per root
-# s), and by how much its stamps are late (s).
+# A consumer gyroscope: bias (rad/s, 1 sigma).
 _BIAS = 0.01
+# Noise of a sample (rad/s).
 _RATE_NOISE = np.radians(0.1)
+# Random walk of the bias (rad/s per root s).
 _BIAS_WALK = np.radians(0.002)
+# Delay of its stamps (s).
 _LATE_S = 0.005
 # Steps of a coarse gyroscope (rad/s).
 _RATE_STEP = np.radians(2.0)
 
-# The rotation of the child's rates turns by this (rad) when the mount moves.
+# Rotation vector (rad) by which a mount moves.
 _TURNED = np.radians(2.0) * np.array([0.6, 0.48, 0.64])
 
-
-# By this (m) a lever arm in the TF tree is wrong.
+# Error (m) of a wrong lever arm in the TF tree.
 _WRONG_BY_M = np.array([0.3, -0.2, 0.4])
 
 
@@ -58,6 +64,12 @@ class Recording(NamedTuple):
 
 
 _Random: TypeAlias = np.random.Generator
+
+
+def _fine_times(duration_s: float) -> FloatArray:
+    """Return times (N,) from 0 at the fine rate, s."""
+    n_times = round(duration_s * _FINE_HZ)
+    return np.arange(n_times) / _FINE_HZ
 
 
 def _unchanged(values: FloatArray) -> FloatArray:
@@ -96,7 +108,7 @@ def _height_late(path: FloatArray) -> FloatArray:
     return _with_heights(path, heights)
 
 
-# What a fault makes of the path (N, 3) of an antenna at the fine rate.
+# Effect of each fault on the path (N, 3) of an antenna at the fine rate, before it is sampled.
 _OF_PATH: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clean": _unchanged,
     "delayed 150 ms": _unchanged,
@@ -123,7 +135,7 @@ def _with_pressure_drift(
     return _with_heights(positions, positions[:, 2] + drift)
 
 
-# What a fault makes of measured positions (N, 3), at so many a second.
+# Effect of some faults on measured positions (N, 3); the second argument is their rate (Hz).
 _OF_POSITIONS: Mapping[
     str, Callable[[FloatArray, float, _Random], FloatArray]
 ] = {
@@ -145,7 +157,8 @@ def _beside(stream: Trajectory, translations: FloatArray) -> Trajectory:
     return replace(stream, poses=stream.poses @ mounts)
 
 
-# Positions that were computed from the poses of the other sensor.
+# Streams whose positions are computed from the poses of the other sensor. The arguments are the
+# stream of poses, the lever arm (3,) and a generator.
 _COPIES: Mapping[
     str, Callable[[Trajectory, FloatArray, _Random], Trajectory]
 ] = {
@@ -166,6 +179,7 @@ OF_POSITIONS = (*_OF_PATH, *_COPIES)
 
 
 def _interpolated(positions: FloatArray, stride: int) -> FloatArray:
+    """Keep every ``stride``-th position, and interpolate between them."""
     rows = np.arange(len(positions))
     columns = [
         np.interp(rows, rows[::stride], column[::stride])
@@ -183,12 +197,13 @@ def _resampled(stream: Trajectory, rate_hz: float) -> Trajectory:
 
 
 def positions(platform: str, fault: str, seed: int) -> Recording:
-    """Poses of an odometry, and positions of an antenna with a fault of :data:`OF_POSITIONS`."""
+    """Simulate poses of an odometry, and positions of an antenna with a fault.
+
+    ``fault`` is an entry of :data:`OF_POSITIONS`.
+    """
     kind = PLATFORMS[platform]
-    seeds = (seed, sorted(PLATFORMS).index(platform), 77)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
-        seeds
-    ).spawn(4)
+    generators = generators_of(platform, seed, 77)
+    motion_rng, mount_rng, odometry_rng, random = generators
     motion = kind.motion(motion_rng, kind.duration_s)
     lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
     parent = kind.measured(motion, odometry_rng)
@@ -198,11 +213,10 @@ def positions(platform: str, fault: str, seed: int) -> Recording:
             copy.stamps_ns, copy.poses[:, :3, 3], "antenna", "map"
         )
         return Recording(parent, child, lever_arm)
-    fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
+    fine_s = _fine_times(kind.duration_s - 1.0)
     Ts = motion.at(fine_s)
-    world = se3.rotation_exp(
-        np.array([0.0, 0.0, mount_rng.uniform(-np.pi, np.pi)])
-    )
+    yaw = mount_rng.uniform(-np.pi, np.pi)
+    world = se3.rotation_exp(np.array([0.0, 0.0, yaw]))
     path = (Ts[:, :3, :3] @ lever_arm + Ts[:, :3, 3]) @ world
     stride = round(_FINE_HZ / kind.positions_hz)
     taken = np.arange(stride // 4, len(fine_s), stride)
@@ -226,7 +240,7 @@ def _misaligned(rates: FloatArray) -> FloatArray:
 
 
 def _moved(values: FloatArray) -> FloatArray:
-    """Rates (N, 3) or orientations (N, 3, 3) of a mount that moves half-way."""
+    """Return rates (N, 3) or orientations (N, 3, 3) of a sensor whose mount moves half-way."""
     half = len(values) // 2
     later = values[half:] @ se3.rotation_exp(_TURNED)
     return np.concatenate([values[:half], later])
@@ -241,7 +255,7 @@ def _stepped(rates: FloatArray) -> FloatArray:
     return np.round(rates / _RATE_STEP) * _RATE_STEP
 
 
-# What a fault makes of the rates (N, 3) of a gyroscope.
+# Effect of each fault on the true rates (N, 3) of a gyroscope.
 _OF_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clean": _unchanged,
     "own rates": _unchanged,
@@ -260,7 +274,7 @@ _OF_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "degrees": np.degrees,
 }
 
-# What a fault makes of measured rates (N, 3), with bias and noise.
+# Effect of some faults on measured rates (N, 3), which have bias and noise.
 _OF_MEASURED_RATES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clipped": _clipped,
     "steps of 2 deg/s": _stepped,
@@ -270,20 +284,23 @@ OF_RATES = tuple(_OF_RATES)
 
 
 def rates(platform: str, fault: str, seed: int) -> Recording:
-    """Poses of an odometry, and rates of a gyroscope with a fault of :data:`OF_RATES`."""
+    """Simulate poses of an odometry, and rates of a gyroscope with a fault.
+
+    ``fault`` is an entry of :data:`OF_RATES`.
+    """
     kind = PLATFORMS[platform]
-    seeds = (seed, sorted(PLATFORMS).index(platform), 78)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
-        seeds
-    ).spawn(4)
+    generators = generators_of(platform, seed, 78)
+    motion_rng, mount_rng, odometry_rng, random = generators
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     parent = kind.measured(motion, odometry_rng)
     if fault == "copied, turned":
         return Recording(parent, _differentiated(parent, rotation), rotation)
-    fine_s = np.arange(round(kind.duration_s * _FINE_HZ)) / _FINE_HZ
-    own = motion.twists(fine_s)[:, 3:]
-    measured = _OF_RATES[fault](own if fault == "own rates" else own @ rotation)
+    fine_s = _fine_times(kind.duration_s)
+    parent_rates = motion.twists(fine_s)[:, 3:]
+    is_of_parent = fault == "own rates"
+    true_rates = parent_rates if is_of_parent else parent_rates @ rotation
+    measured = _OF_RATES[fault](true_rates)
     measured = measured + _BIAS * random.standard_normal(3)
     measured += _RATE_NOISE * random.standard_normal(measured.shape)
     walk = _BIAS_WALK * (30.0 if fault == "bias walks" else 1.0)
@@ -297,9 +314,9 @@ def rates(platform: str, fault: str, seed: int) -> Recording:
 
 
 def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
-    """Return rates that are differentiated from the parent's orientations.
+    """Return rates that are the derivatives of the parent's orientations.
 
-    A static transform of a TF tree has turned the orientations by ``rotation``.
+    The orientations are first turned by ``rotation``, as by a static transform of a TF tree.
     """
     orientations = se3.rotation_of(parent.poses) @ rotation
     steps = se3.rotations_between(orientations[:-1], orientations[1:])
@@ -311,9 +328,11 @@ def _differentiated(parent: Trajectory, rotation: FloatArray) -> Trajectory:
     )
 
 
-# Orientations of an attitude sensor: rate (Hz), white noise (rad), drift (rad per root s).
+# An attitude sensor: rate (Hz).
 _ATTITUDE_HZ = 50.0
+# White noise of its orientations (rad).
 _ATTITUDE_NOISE = np.radians(0.1)
+# Drift of its orientations (rad per root s).
 _ATTITUDE_WALK = np.radians(0.02)
 
 
@@ -334,9 +353,10 @@ def _with_yaw_gain(rotations: FloatArray) -> FloatArray:
 
 
 def _filtered(
-    rotations: FloatArray, of_values: Callable[[FloatArray], FloatArray]
+    rotations: FloatArray, low_pass: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
-    flat = of_values(rotations.reshape(-1, 9))
+    """Filter the entries of rotation matrices (N, 3, 3)."""
+    flat = low_pass(rotations.reshape(-1, 9))
     return se3.nearest_rotation(flat.reshape(-1, 3, 3))
 
 
@@ -346,7 +366,7 @@ def _reordered(rotations: FloatArray) -> FloatArray:
     return Rotation.from_quat(quats_wxyz).as_matrix()
 
 
-# What a fault makes of the orientations (N, 3, 3) of an attitude sensor at the fine rate.
+# Effect of each fault on the true orientations (N, 3, 3) of an attitude sensor, at the fine rate.
 _OF_ROTATIONS: Mapping[str, Callable[[FloatArray], FloatArray]] = {
     "clean": _unchanged,
     "copied": _unchanged,
@@ -367,12 +387,13 @@ OF_ROTATIONS = tuple(_OF_ROTATIONS)
 
 
 def rotations(platform: str, fault: str, seed: int) -> Recording:
-    """Poses of an odometry, and orientations with a fault of :data:`OF_ROTATIONS`."""
+    """Simulate poses of an odometry, and orientations of an attitude sensor with a fault.
+
+    ``fault`` is an entry of :data:`OF_ROTATIONS`.
+    """
     kind = PLATFORMS[platform]
-    seeds = (seed, sorted(PLATFORMS).index(platform), 79)
-    motion_rng, mount_rng, odometry_rng, random = np.random.default_rng(
-        seeds
-    ).spawn(4)
+    generators = generators_of(platform, seed, 79)
+    motion_rng, mount_rng, odometry_rng, random = generators
     motion = kind.motion(motion_rng, kind.duration_s)
     mount = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     parent = kind.measured(motion, odometry_rng)
@@ -386,7 +407,7 @@ def rotations(platform: str, fault: str, seed: int) -> Recording:
             Trajectory(parent.stamps_ns, poses, "ahrs", "", "rotations"),
             mount,
         )
-    fine_s = np.arange(round((kind.duration_s - 1.0) * _FINE_HZ)) / _FINE_HZ
+    fine_s = _fine_times(kind.duration_s - 1.0)
     own = motion.at(fine_s)[:, :3, :3] @ mount
     stride = round(_FINE_HZ / _ATTITUDE_HZ)
     measured = _OF_ROTATIONS[fault](own)[::stride]
@@ -467,24 +488,19 @@ _NAMED: Mapping[str, Mapping[str, str]] = {
     },
 }
 
-# Targets that a person would set: m for positions; deg for rates and rotations.
-_TARGETS_M = {
-    "car": 0.15,
-    "excavator": 0.05,
-    "hand": 0.01,
-    "drone": 0.05,
-    "drone_slam": 0.05,
-    "agv": 0.05,
-}
+# Target that a person would set for rates and rotations of machines that turn slowly (deg).
 _SLOW_TARGET_DEG = 0.5
+# The same for other machines (deg).
 _TARGET_DEG = 0.3
+# Machines that turn slowly.
 _SLOW = ("excavator", "agv")
 
 
 def options_of(kind: str, platform: str) -> dict[str, Any]:
-    """Targets of a calibration, as a person would set them."""
+    """Return the targets of a calibration, as a person would set them."""
     if kind == "positions":
-        return {"target_translation": _TARGETS_M[platform]}
+        metres, _ = TARGETS[platform]
+        return {"target_translation": metres}
     degrees = _SLOW_TARGET_DEG if platform in _SLOW else _TARGET_DEG
     return {"target_rotation": float(np.radians(degrees))}
 
@@ -503,7 +519,7 @@ def largest_ratio(kind: str, result: Calibration, truth: FloatArray) -> float:
 
 
 def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
-    """Rows of the table of a kind, one for each fault."""
+    """Yield the row of each fault of a kind of streams."""
     make, faults = KINDS[kind]
     for fault in faults:
         names = set(_NAMED[kind].get(fault, "").split())
@@ -530,22 +546,17 @@ def rows(kind: str, seeds: Sequence[int]) -> Iterator[dict[str, object]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the table; returns the exit code."""
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    """Print the table, and return the exit code."""
+    seeds = seeds_of(arguments)
     print(markdown_table(rows(arguments.kind, seeds)))
     return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study; returns the exit code."""
+    """Run the study, and return the exit code."""
     parser = study_parser("reproduction.part_faults", __doc__)
     parser.add_argument("kind", choices=tuple(KINDS))
-    parser.add_argument(
-        "--seeds", type=int, default=2, help="recordings of a kind. Default: 2"
-    )
-    parser.add_argument(
-        "--first-seed", type=int, default=100, help="Default: 100"
-    )
+    add_seed_options(parser, 2)
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

@@ -1,10 +1,10 @@
-"""``python -m reproduction.partial rates`` and ``positions``: what streams of rates or positions
-alone give, against the truth and against whole poses.
+"""``python -m reproduction.partial rates`` or ``positions``: errors of simulated calibrations.
+
+``rates``: rotation of a gyroscope against an odometry. ``positions``: lever arm of an RTK receiver.
 """
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,71 +14,46 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.coverage import motions
-from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, slam, stamps_ns
+from reproduction.coverage.classes import VIO, slam, stamps_ns
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
+from reproduction.platforms import PLATFORMS
 from reproduction.writing import markdown_table, show, study_parser, triple
-
-# Normal errors are within so many sigmas in nine cases of ten.
-QUANTILE_90 = 1.645
 
 _Motion = Callable[[np.random.Generator, float], motions.Motion]
 
 
-class Machine(NamedTuple):
-    """How a machine moves, its odometry and the rate of that (Hz), how long it is recorded (s) and
-    the size of its lever arm (m).
-    """
-
-    motion: _Motion
-    odometry: SensorErrors
-    rate_hz: float
-    duration_s: float
-    lever_m: float
-
-
+# Simulated machines with a receiver.
 MACHINES = {
-    "car": Machine(
-        motion=motions.car,
-        odometry=LIDAR_ODOMETRY,
-        rate_hz=10.0,
-        duration_s=240.0,
-        lever_m=2.0,
-    ),
-    "excavator": Machine(
-        motion=motions.excavator,
-        odometry=LIDAR_ODOMETRY,
-        rate_hz=10.0,
-        duration_s=240.0,
-        lever_m=2.0,
-    ),
-    "hand-held": Machine(
-        motion=motions.hand_held,
-        odometry=VIO,
-        rate_hz=30.0,
-        duration_s=120.0,
-        lever_m=0.3,
-    ),
+    "car": PLATFORMS["car"],
+    "excavator": PLATFORMS["excavator"],
+    "hand-held": PLATFORMS["hand"]._replace(duration_s=120.0),
 }
 
-# An RTK receiver: rate, white noise of a fixed solution (m); outages per second and how long they
-# last (s); float solutions per minute, how long they last (s), their error (m) and its correlation
-# time (s).
+# An RTK receiver: rate of its positions (Hz).
 _FIXES_HZ = 5.0
+# White noise of a position with fixed ambiguities (m).
 _FIXED_M = 0.01
+# Outages per second, and their shortest and longest duration (s).
 _OUTAGES_HZ = 0.2
 _OUTAGE_S = (0.5, 1.5)
+# Float solutions (ambiguities not fixed) per minute, and their shortest and longest duration (s).
 _FLOATS_PER_MIN = 1.0
 _FLOAT_S = (5.0, 15.0)
+# Error of a float solution (m), and its correlation time (s).
 _FLOAT_M = 0.3
 _FLOAT_TAU_S = 5.0
 
-# A consumer gyroscope: rate, noise per sample (rad/s), bias and its walk (rad/s, per root s), and
-# by how much its stamps are late (s).
+# A consumer gyroscope: rate (Hz).
 _RATES_HZ = 200.0
+# Noise of a sample (rad/s).
 _RATE_NOISE = np.radians(0.1)
+# Bias (rad/s, 1 sigma), and its random walk (rad/s per root s).
 _BIAS = 0.01
 _BIAS_WALK = np.radians(0.002)
+# Delay of its stamps (s).
 _LATE_S = 0.005
+# Motion and errors of the odometry, by name.
 _TURNING: dict[str, tuple[_Motion, SensorErrors]] = {
     "hand-held, visual-inertial odometry": (motions.hand_held, VIO),
     "hand-held, white noise of 0.2 deg": (
@@ -93,7 +68,7 @@ _TURNING: dict[str, tuple[_Motion, SensorErrors]] = {
 def simulated_positions(
     name: str, seed: int
 ) -> tuple[Trajectory, Trajectory, FloatArray]:
-    """Poses of the odometry, positions of the antenna, and the lever arm (3,)."""
+    """Simulate poses of the odometry, positions of the antenna, and the lever arm (3,)."""
     machine = MACHINES[name]
     seeds = (seed, sorted(MACHINES).index(name))
     generators = np.random.default_rng(seeds).spawn(4)
@@ -129,14 +104,14 @@ def _odometry(
     step_s: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Measured poses (N, 4, 4) of a motion."""
+    """Return the measured poses (N, 4, 4) of a motion."""
     true_poses = motion.at(times_s)
     twists = motion.twists(times_s)
     return draw(errors, true_poses, twists, step_s, rng).poses
 
 
 def _float_errors(times_s: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Errors (N, 3) of float solutions; zero where the solution is fixed."""
+    """Return errors (N, 3) of float solutions; zero where the solution is fixed."""
     errors = np.zeros((len(times_s), 3))
     stay = np.exp(-1.0 / (_FIXES_HZ * _FLOAT_TAU_S))
     change = np.sqrt(1.0 - stay**2)
@@ -155,7 +130,7 @@ def _float_errors(times_s: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _received(count: int, rng: np.random.Generator) -> BoolArray:
-    """Which of the fixes arrive (N,)."""
+    """Return whether each position is received (N,), outside of the outages."""
     received = np.ones(count, dtype=bool)
     is_start = rng.random(count) < _OUTAGES_HZ / _FIXES_HZ
     for start in np.flatnonzero(is_start):
@@ -166,13 +141,13 @@ def _received(count: int, rng: np.random.Generator) -> BoolArray:
 
 
 def _covers(ratios: FloatArray) -> str:
-    """Share of errors over their sigmas that the 90 % interval covers."""
-    is_covered = np.abs(ratios) < QUANTILE_90
+    """Return the share of errors within the 90 % interval; ``ratios`` are errors in sigmas."""
+    is_covered = np.abs(ratios) < HALF_WIDTH_90
     return f"{np.mean(is_covered):.0%}"
 
 
 def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
-    """Rows of the table of simulated receivers."""
+    """Yield the row of each simulated machine with a receiver."""
     for name in MACHINES:
         errors = []
         sigmas = []
@@ -196,7 +171,7 @@ def position_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 def simulated_rates(
     name: str, seed: int, duration_s: float = 60.0, rate_hz: float = 20.0
 ) -> tuple[Trajectory, Trajectory, FloatArray]:
-    """Poses of the parent, rates of the child, the rotation (3, 3) between them."""
+    """Simulate poses of the parent, rates of the child, and the rotation (3, 3) between them."""
     kind, errors = _TURNING[name]
     generators = np.random.default_rng(seed).spawn(4)
     motion_rng, mount_rng, parent_rng, child_rng = generators
@@ -219,7 +194,7 @@ def simulated_rates(
 
 
 def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
-    """Rows of the table of simulated gyroscopes."""
+    """Yield the row of each motion with a gyroscope."""
     for name in _TURNING:
         angles = []
         ratios = []
@@ -242,7 +217,7 @@ def rate_rows(n_seeds: int) -> Iterator[dict[str, object]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Make the tables; returns the exit code."""
+    """Print the table, and return the exit code."""
     if arguments.what == "rates":
         tables = {"rates": markdown_table(rate_rows(arguments.seeds))}
     else:
@@ -252,14 +227,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study; returns the exit code."""
+    """Run the study, and return the exit code."""
     parser = study_parser("reproduction.partial", __doc__)
     parser.add_argument("what", choices=("rates", "positions"))
     parser.add_argument(
         "--seeds",
         type=int,
         default=40,
-        help="recordings of a kind. Default: 40",
+        help="recordings of each row. Default: 40",
     )
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 

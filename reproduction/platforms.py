@@ -16,6 +16,17 @@ _WHEELS = SensorErrors(
 )
 
 
+def generators_of(
+    platform: str, seed: int, study: int
+) -> list[np.random.Generator]:
+    """Return random generators for the motion, the mount, the parent and the child of a recording.
+
+    ``study`` is a number that no other study has.
+    """
+    key = (seed, sorted(PLATFORMS).index(platform), study)
+    return np.random.default_rng(key).spawn(4)
+
+
 class Platform(NamedTuple):
     """A machine with an odometry, and an antenna beside it.
 
@@ -111,4 +122,14 @@ PLATFORMS = {
         noise_m=0.005,
         positions_hz=10.0,
     ),
+}
+
+# Targets that a person would set for poses (m and deg).
+TARGETS = {
+    "car": (0.15, 1.0),
+    "excavator": (0.05, 1.0),
+    "hand": (0.01, 0.5),
+    "drone": (0.05, 0.5),
+    "drone_slam": (0.05, 0.5),
+    "agv": (0.05, 1.0),
 }

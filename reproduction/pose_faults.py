@@ -1,7 +1,8 @@
-"""Two streams of poses with faults of sampling and of dependence, on simulated machines.
+"""Deliberate faults of two streams of poses: sampling, prediction, and one stream that depends on
+the other, on simulated machines.
 
 ``python -m reproduction.pose_faults --seeds 3`` prints a row for each fault: verdicts, findings,
-and results beyond 3.3 standard deviations (with the allowance) that may be used.
+and the number of USE results with an error above 3.3 standard deviations (with the allowance).
 """
 
 import argparse
@@ -20,8 +21,14 @@ from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction import fault_counts
 from reproduction.coverage.classes import LIDAR_ODOMETRY, VIO, stamps_ns
 from reproduction.coverage.sensor_errors import SensorErrors, draw, sigmas
-from reproduction.platforms import PLATFORMS
-from reproduction.writing import counted, markdown_table, study_parser
+from reproduction.platforms import PLATFORMS, TARGETS, generators_of
+from reproduction.writing import (
+    add_seed_options,
+    counted,
+    markdown_table,
+    seeds_of,
+    study_parser,
+)
 
 _CAMERA = SensorErrors(white=sigmas(0.001, 0.04), walk=sigmas(0.006, 0.05))
 _STEREO = SensorErrors(
@@ -38,17 +45,7 @@ _CHILDREN: Mapping[str, tuple[SensorErrors, float]] = {
     "agv": (LIDAR_ODOMETRY, 10.0),
 }
 
-# Targets that a person would set: m and deg.
-_TARGETS = {
-    "car": (0.15, 1.0),
-    "excavator": (0.05, 1.0),
-    "hand": (0.01, 0.5),
-    "drone": (0.05, 0.5),
-    "drone_slam": (0.05, 0.5),
-    "agv": (0.05, 1.0),
-}
-
-# The assumed mount of a computed or fused stream is wrong by 8 cm and 3.5 deg.
+# Error of the mount (8 cm and 3.5 deg) that a computed or corrected stream assumes.
 _WRONG_MOUNT = se3.exp(
     np.array(
         [0.05, -0.05, 0.04, *(np.radians(3.5) * np.array([0.6, -0.48, 0.64]))]
@@ -76,17 +73,16 @@ _Damage: TypeAlias = Callable[[Streams, _Random], Streams]
 
 
 def clean(platform: str, seed: int) -> Streams:
-    """Two independent odometries of a platform, with stamps of their own."""
+    """Simulate two independent odometries of a platform, with different stamps."""
     kind = PLATFORMS[platform]
-    seeds = (seed, sorted(PLATFORMS).index(platform), 902)
-    generators = np.random.default_rng(seeds).spawn(4)
+    generators = generators_of(platform, seed, 902)
     motion_rng, mount_rng, parent_rng, child_rng = generators
     motion = kind.motion(motion_rng, kind.duration_s)
     rotation = se3.rotation_exp(mount_rng.uniform(-1.7, 1.7, 3))
     lever_arm = kind.lever_m * mount_rng.standard_normal(3) * [1.0, 1.0, 0.7]
     X = se3.from_rotation_translation(rotation, lever_arm)
     errors, rate_hz = _CHILDREN[platform]
-    # Seconds at the start and the end that only the parent has.
+    # Time (s) at the start and at the end in which only the parent has poses.
     margin_s = 0.3 + 0.37 / rate_hz
 
     def measured(
@@ -115,7 +111,7 @@ def _posed(streams: Streams, child: FloatArray) -> Streams:
 
 
 def interpolated(rate_hz: float) -> _Damage:
-    """Positions of the child at a lower rate, interpolated to its orientations."""
+    """Sample the child's positions at a lower rate, and interpolate them to its stamps."""
 
     def damage(streams: Streams, _: _Random) -> Streams:
         poses = streams.child.poses.copy()
@@ -132,7 +128,7 @@ def interpolated(rate_hz: float) -> _Damage:
 
 
 def at_constant_velocity(fix_hz: float) -> _Damage:
-    """Poses of the child are predicted at constant velocity between fixes."""
+    """Predict the child's poses at constant velocity between measured poses (``fix_hz``)."""
 
     def damage(streams: Streams, _: _Random) -> Streams:
         poses = streams.child.poses
@@ -153,7 +149,7 @@ def at_constant_velocity(fix_hz: float) -> _Damage:
 
 
 def by_imu(fix_hz: float) -> _Damage:
-    """Poses of the child are predicted by an IMU with biases between fixes."""
+    """Predict the child's poses by an IMU with biases between measured poses (``fix_hz``)."""
 
     def damage(streams: Streams, random: _Random) -> Streams:
         bias = _IMU_BIAS * random.standard_normal(6)
@@ -170,7 +166,7 @@ def by_imu(fix_hz: float) -> _Damage:
 
 
 def late(scatter_s: float) -> _Damage:
-    """Stamps of the child are those of arrival, after delays and in order."""
+    """Stamp the child's poses with their arrival: exponential delays, order kept."""
 
     def damage(streams: Streams, random: _Random) -> Streams:
         count = len(streams.child)
@@ -188,7 +184,7 @@ def late(scatter_s: float) -> _Damage:
 
 
 def computed(noise_m: float) -> _Damage:
-    """The child is computed from the parent through a wrong mount, with noise of its own."""
+    """Compute the child from the parent through a wrong mount, and add noise."""
 
     def damage(streams: Streams, random: _Random) -> Streams:
         poses = streams.parent.at(streams.child.stamps_ns, straight=True)
@@ -201,7 +197,7 @@ def computed(noise_m: float) -> _Damage:
 
 
 def _filtered(stream: Trajectory, aims: FloatArray, tau_s: float) -> Trajectory:
-    """Poses of a stream that a filter corrects towards others (N, 4, 4)."""
+    """Correct the poses of a stream towards the poses ``aims`` (N, 4, 4) by a filter."""
     gain = 1.0 - np.exp(-stream.interval_s / tau_s)
     steps = se3.inverse(stream.poses[:-1]) @ stream.poses[1:]
     poses = [aims[0]]
@@ -214,7 +210,7 @@ def _filtered(stream: Trajectory, aims: FloatArray, tau_s: float) -> Trajectory:
 
 
 def fused(tau_s: float) -> _Damage:
-    """A filter corrects the child by the parent through a wrong mount."""
+    """Correct the child by the parent through a wrong mount."""
 
     def damage(streams: Streams, _: _Random) -> Streams:
         aims = streams.parent.at(streams.child.stamps_ns)
@@ -225,7 +221,7 @@ def fused(tau_s: float) -> _Damage:
 
 
 class _Fault(NamedTuple):
-    """Damage of a fault, and the codes of the findings that name it."""
+    """A fault: the function that damages streams, and the codes of findings that name the fault."""
 
     damage: _Damage
     codes: frozenset[str]
@@ -254,7 +250,7 @@ FAULTS: Mapping[str, _Fault] = {
 
 
 def faulty(platform: str, fault: str, seed: int) -> Streams:
-    """Streams of a platform with a fault of :data:`FAULTS`; "clean" has none."""
+    """Simulate streams with a fault of :data:`FAULTS`, or without a fault ("clean")."""
     streams = clean(platform, seed)
     if fault == "clean":
         return streams
@@ -274,11 +270,11 @@ def largest_ratio(result: Calibration, truth: FloatArray) -> float:
 def rows(
     faults: Sequence[str], seeds: Sequence[int]
 ) -> Iterator[dict[str, object]]:
-    """Rows of the table, one for each fault."""
+    """Yield the row of each fault."""
     for fault in faults:
         names = FAULTS[fault].codes if fault in FAULTS else frozenset()
         tally = fault_counts.Tally()
-        for platform, (metres, degrees) in _TARGETS.items():
+        for platform, (metres, degrees) in TARGETS.items():
             for seed in seeds:
                 streams = faulty(platform, fault, seed)
                 result = hec.calibrate(
@@ -299,24 +295,19 @@ def rows(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the table; returns the exit code."""
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    """Print the table, and return the exit code."""
+    seeds = seeds_of(arguments)
     print(markdown_table(rows(arguments.faults or ["clean", *FAULTS], seeds)))
     return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study; returns the exit code."""
+    """Run the study, and return the exit code."""
     parser = study_parser("reproduction.pose_faults", __doc__)
     parser.add_argument(
-        "faults", nargs="*", help="rows of the table. Default: all"
+        "faults", nargs="*", help="faults of the table. Default: all"
     )
-    parser.add_argument(
-        "--seeds", type=int, default=1, help="recordings of a kind. Default: 1"
-    )
-    parser.add_argument(
-        "--first-seed", type=int, default=100, help="Default: 100"
-    )
+    add_seed_options(parser, 1)
     return exit_code_of(lambda: run(parser.parse_args(argv)))
 
 

@@ -1,8 +1,9 @@
 """Trajectories and results published with Välimäki et al. 2023
 (github.com/tau-alma/trajectory_calibration_experiments, MIT licence).
 
-The folder is a clone of that repository: ``kitti_tests`` and ``simulation_tests`` hold trajectories
-in TUM format, ``calib`` (or ``published``) one CSV of results per test set.
+The folder of the data is a clone of this repository. ``kitti_tests`` and ``simulation_tests``
+contain trajectories in TUM format. ``calib`` (or ``published``) contains a CSV file of results for
+each data set.
 """
 
 import csv
@@ -26,8 +27,7 @@ METHODS = ("ali", "dnl", "dnlo", "park", "taylor", "zhuang")
 REFERENCES = ("A", "B1", "B5", "B10", "C5", "C10")
 N_RUNS = 38
 
-# Level folders of a simulated data set and the levels' values, and the column of its CSV that has
-# them.
+# Levels of each simulated data set, by the names of their folders.
 _LEVELS: dict[str, dict[str, float | None]] = {
     "noise": {
         f"noise_{level:.6f}": level
@@ -43,6 +43,7 @@ _LEVELS: dict[str, dict[str, float | None]] = {
     },
     "mixture": {".": None},
 }
+# Column of the level in the CSV file of each data set.
 _LEVEL_COLUMNS: dict[str, str | None] = {
     "noise": "noise_var",
     "outliers": "outliers",
@@ -57,15 +58,15 @@ LEVELS = {
 KEYFRAMES = "KeyFrameTrajectory_TUM_Format.txt"
 KITTI_DRIVES = ("2011_09_30_drive_0027", "2011_10_03_drive_0027")
 
-# The answers of a closed-form method agree to the eight digits that are printed.
+# Largest difference of two matrices (m or 1) that are the same answer, printed with eight digits.
 _SAME_ANSWER = 1e-6
 
 
-# The published ground truth of both KITTI drives is the calibration of the cameras as they are; the
-# trajectories come from images that KITTI had rectified, which turns all cameras into a common
-# orientation. The truth of these, from the calibration files that come with the drives:
-# calib_cam_to_cam.txt of 2011_10_03: P_rect_02, projection matrix of the left colour camera. Its
-# last column is -K times the camera's place in the frame of camera 0, the left grey one.
+# The published ground truth of both KITTI drives is the pose of the unrectified cameras. The
+# trajectories were computed from rectified images, whose cameras have a common orientation. The
+# true poses of the rectified cameras follow from the calibration files of the drives.
+# P_rect_02 in calib_cam_to_cam.txt of 2011_10_03: projection matrix of the left colour camera. Its
+# last column is -K times the camera's position in the frame of camera 0, the left grey camera.
 _P_RECT_02 = np.array(
     [
         [718.856, 0.0, 607.1928, 45.38225],
@@ -74,8 +75,8 @@ _P_RECT_02 = np.array(
     ]
 )
 
-# calib_velo_to_cam.txt and R_rect_00 of calib_cam_to_cam.txt of 2011_09_30, put together: rectified
-# camera 0 in the lidar's frame.
+# Pose of the rectified camera 0 in the lidar's frame, from calib_velo_to_cam.txt and R_rect_00 in
+# calib_cam_to_cam.txt of 2011_09_30.
 _T_LIDAR_CAMERA = se3.from_quat_xyzw(
     (0.3335, -0.0048, -0.0756), (-0.499146, 0.504085, -0.496817, 0.499924)
 )
@@ -90,8 +91,8 @@ RECTIFIED = {
 
 @dataclass(frozen=True)
 class PublishedResult:
-    """A row of the published results: the answer, printed with eight digits, and its errors (m,
-    rad) with all of them.
+    """A row of the published results: the extrinsic with eight digits, and its errors (m, rad)
+    with all digits.
     """
 
     T_parent_child: FloatArray
@@ -119,7 +120,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Such as noise/0.002/run_12."""
+        """Name of the case, such as noise/0.002/run_12."""
         folders = path_to(self.dataset, self.level)
         return "/".join([*folders, self.run])
 
@@ -129,12 +130,12 @@ class Case:
         return self.child.stamps_ns
 
     def pairs(self, reference: str) -> MotionPairs:
-        """Motion pairs of a reference."""
+        """Return the motion pairs of a reference."""
         return motion_pairs(self.parent.poses, self.child.poses, reference)
 
 
 def path_to(dataset: str, level: float | None) -> list[str]:
-    """The data set and, if it has one, the level."""
+    """Return the name of the data set and, if there is a level, its text."""
     if level is None:
         return [dataset]
     return [dataset, f"{level:g}"]
@@ -142,37 +143,41 @@ def path_to(dataset: str, level: float | None) -> list[str]:
 
 # Name, parent, child, truth.
 Run = tuple[str, Trajectory, Trajectory, FloatArray]
-# By level (None without one), then by method and reference, in the order of the file.
+# Results by level (None without levels), then by method and reference, in the order of the file.
 PublishedResults = dict[
     float | None, dict[tuple[str, str], list[PublishedResult]]
 ]
 
 
 def find_folder(folder: str | Path) -> str:
-    """The folder of the published data: itself, or the folder valimaki2023 in it. Raises InputError
-    if it is none.
+    """Return the folder of the published data: ``folder``, or the folder valimaki2023 in it.
+
+    Raises InputError if it does not contain the published data.
     """
     inside = Path(folder) / "valimaki2023"
-    found_in = inside if inside.is_dir() else Path(folder)
-    names = ["kitti_tests", "simulation_tests", results_folder(found_in).name]
-    missing = [name for name in names if not (found_in / name).is_dir()]
+    data_folder = inside if inside.is_dir() else Path(folder)
+    results_name = results_folder(data_folder).name
+    names = ["kitti_tests", "simulation_tests", results_name]
+    missing = [name for name in names if not (data_folder / name).is_dir()]
     if missing:
         raise InputError(
-            f"{found_in}: expected the published data, a clone of "
+            f"{data_folder}: expected the published data, a clone of "
             f"github.com/tau-alma/trajectory_calibration_experiments; it has no {missing[0]}"
         )
-    return str(found_in.resolve())
+    return str(data_folder.resolve())
 
 
 def results_folder(folder: Path) -> Path:
-    """Where in the folder the CSV files of results are."""
+    """Return the folder of the CSV files of results, in the folder of the data."""
     inside = folder / "published"
     return inside if inside.is_dir() else folder / "calib"
 
 
 def load_kitti_short(folder: str | Path) -> Case:
-    """Drive 2011_09_30_drive_0027: parent lidar, child grey stereo camera without its first pose,
-    which precedes the lidar's first. Raises InputError if a file is missing or cannot be used.
+    """Load drive 2011_09_30_drive_0027: parent lidar, child grey stereo camera.
+
+    The first pose of the camera is dropped: it is older than the first pose of the lidar. Raises
+    InputError if a file is missing or cannot be used.
     """
     return _kitti_case(
         Path(folder),
@@ -186,8 +191,9 @@ def load_kitti_short(folder: str | Path) -> Case:
 
 
 def load_kitti_long(folder: str | Path) -> Case:
-    """Drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera. Raises
-    InputError if a file is missing or cannot be used.
+    """Load drive 2011_10_03_drive_0027: parent grey stereo camera, child colour stereo camera.
+
+    Raises InputError if a file is missing or cannot be used.
     """
     return _kitti_case(
         Path(folder),
@@ -208,12 +214,12 @@ def _kitti_case(
     results_file: str,
     first: int = 0,
 ) -> Case:
-    """A drive from its files; of the child from pose ``first`` on."""
+    """Load a drive from its files; the child's poses before pose ``first`` are dropped."""
     drive = folder / "kitti_tests" / name
     parent, child = (read_trajectory(drive / stream) for stream in streams)
     child = child[first:]
-    # As in the paper: the parent's poses at the child's stamps, extrapolated along its end segments
-    # if the child's stamps reach further.
+    # As in the paper: the parent is interpolated at the child's stamps. Outside of the parent's
+    # stamps, its first and last segments are extrapolated.
     parent_poses = parent.at(child.stamps_ns, extrapolate=True, straight=True)
     parent_at_child = Trajectory(child.stamps_ns, parent_poses)
     T_parent_child = read_trajectory(drive / truth).poses[0]
@@ -235,9 +241,11 @@ def load_simulated(
     datasets: Sequence[str] = SIMULATED,
     levels: Sequence[float] | None = None,
 ) -> list[Case]:
-    """The simulated cases by data set, level and the order of the published results: 38
-    trajectories at each of six levels of noise, outliers and drift, or only at ``levels``; and in
-    the mixture, which has none. Raises InputError if a file is missing or cannot be used.
+    """Load the simulated cases by data set and level, in the order of the published results.
+
+    Each level has 38 trajectories. Noise, outliers and drift have six levels, of which ``levels``
+    are loaded (all by default). The mixture has no levels. Raises InputError if a file is missing
+    or cannot be used.
     """
     folder = Path(folder)
     cases = []
@@ -256,7 +264,7 @@ def load_simulated(
 
 
 def _read_runs(folder: Path) -> list[Run]:
-    """(name, parent, child, truth) of every run."""
+    """Read (name, parent, child, truth) of every run."""
     runs = []
     for run in sorted(folder.glob("run_*")):
         parent = read_trajectory(run / "T_S1_W1.txt")
@@ -272,16 +280,16 @@ def _match_runs(
     runs: Sequence[Run],
     results: Mapping[tuple[str, str], Sequence[PublishedResult]],
 ) -> list[Case]:
-    """Cases in the order of the published rows, which do not name their trajectory.
+    """Return the cases in the order of the published rows, which do not name their trajectory.
 
-    Every (method, reference) block lists the same trajectories in the same order. Park has a
-    unique answer, so its block identifies them.
+    Every (method, reference) block lists the same trajectories in the same order. Park's method has
+    a unique answer, so its block identifies the trajectories.
     """
     order = _order_of_runs(runs, results)
     if order is None:
         where = dataset if level is None else f"{dataset} at level {level:g}"
         raise InputError(
-            f"the trajectories of {where} do not go with the published results: expected "
+            f"the trajectories of {where} do not match the published results: expected "
             f"{N_RUNS} runs (found {len(runs)}) and {N_RUNS} rows of every method and "
             "reference, one for each run; get the data again"
         )
@@ -299,7 +307,7 @@ def _order_of_runs(
     runs: Sequence[Run],
     results: Mapping[tuple[str, str], Sequence[PublishedResult]],
 ) -> list[int] | None:
-    """Index of the run of each published row; None if runs and rows do not match."""
+    """Return the index of the run of each published row; None if runs and rows do not match."""
     if len(runs) != N_RUNS:
         return None
     for key in product(METHODS, REFERENCES):
@@ -318,14 +326,13 @@ def _order_of_runs(
 
 
 def _read_results(path: Path, level_column: str | None) -> PublishedResults:
-    """Level (None without a column), then (method, reference), to the list of results in the file's
-    order.
-    """
+    """Read a file of results; without a column of levels, all results have the level None."""
     results: PublishedResults = {}
     with open(path, newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
             level = float(row[level_column]) if level_column else None
             method = row["algorithm"].lower()
+            # The file's column "method" contains the reference.
             reference = row["method"].replace("A1", "A")
             results_of_level = results.setdefault(level, {})
             rows_of_method = results_of_level.setdefault(

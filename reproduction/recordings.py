@@ -1,7 +1,7 @@
-"""Real recordings whose answer is known, or that can be calibrated more than once.
+"""Real recordings with a known extrinsic, and rigs with several recordings.
 
-They lie in folders of their own beside the published data of Välimäki et al. 2023. A set whose
-folder is absent is left out, and the page says so.
+Each set of recordings has a folder beside the published data of Välimäki et al. 2023. Sets without
+a folder are left out, and the page lists them.
 """
 
 from __future__ import annotations
@@ -26,32 +26,35 @@ from hand_eye_calib.formats.trajectory_files.reading import (
 )
 from reproduction.published import KEYFRAMES, KITTI_DRIVES, RECTIFIED
 
-# Parts of a drive, by how many there are.
+# Names of the parts of a drive, by the number of parts.
 PARTS = {2: "halves", 3: "thirds"}
 
 _ASL_COLUMNS = "t,x,y,z,qx,qy,qz,qw"
 _ZXL19_COLUMNS = "t,x,y,z,qw,qx,qy,qz"
 
-# A part's parent stream reaches this far over the child's (ns), for interpolation and for the
-# search for the offset.
+# Time (ns) by which the parent's stream of a part exceeds the child's at both ends. The poses are
+# needed for interpolation and for the search for the clock offset.
 _MARGIN_NS = 200_000_000
 
-# A user who knows neither clock nor scale.
-_FOUND = {"time_offset": "estimate", "scale": "auto"}
-_CLOCK_FOUND = {"time_offset": "estimate"}
-_SCALE_FOUND = {"time_offset": "estimate", "scale": "estimate"}
+# Options of a user who knows neither the clock offset nor the scale.
+_CLOCK_AND_SCALE_CHECK = {"time_offset": "estimate", "scale": "auto"}
+# Options of a user who does not know the clock offset.
+_CLOCK = {"time_offset": "estimate"}
+# Options for a camera that has no scale.
+_CLOCK_AND_SCALE = {"time_offset": "estimate", "scale": "estimate"}
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Two streams of one drive, on clocks of their own."""
+    """Two streams of one drive, each with its own clock."""
 
     parent: Trajectory
     child: Trajectory
 
     def parts(self, count: int, offset_s: float) -> list[Recording]:
-        """As many Recordings of equal duration, one after the other; ``offset_s`` brings the
-        child's clock to the parent's.
+        """Divide into ``count`` recordings of equal duration.
+
+        ``offset_s`` is added to the child's stamps, to get stamps of the parent's clock.
         """
         child_ns = self.child.stamps_ns + round(offset_s * 1e9)
         start_ns = max(self.parent.stamps_ns[0], child_ns[0])
@@ -68,8 +71,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class Truth:
-    """A known answer (4, 4), and how well it is known (6,): m along and rad about the axes of the
-    parent sensor; infinite where it is not.
+    """A known extrinsic (4, 4), and its standard deviations (6,).
+
+    The standard deviations are in m along and in rad about the axes of the parent sensor. They are
+    infinite on unknown axes.
     """
 
     T_parent_child: FloatArray
@@ -79,7 +84,7 @@ class Truth:
     def within(
         cls, T_parent_child: FloatArray, metres: object, degrees: object
     ) -> Truth:
-        """Known to so many metres and degrees, one number or one per axis."""
+        """Return a truth with these standard deviations, as a number or as (3,) per axis."""
         parts = [
             np.full(3, 1.0) * metres,
             np.radians(np.full(3, 1.0) * degrees),
@@ -97,18 +102,19 @@ class Rig:
 
     name: str
     recordings: Mapping[str, Recording]
-    # What a user would give.
+    # Options that a user would set.
     options: Mapping[str, Any] = field(default_factory=dict)
     truth: Truth | None = None
-    # Halves and thirds of each recording are repeats, too.
+    # Whether halves and thirds of each recording are calibrated, too.
     is_cut: bool = True
-    # The motion leaves something open: no answer may be called good.
+    # Whether the motion leaves an axis undetermined, so that every result must be refused.
     is_refused: bool = False
 
 
 def real_rigs(folder: Path) -> tuple[list[Rig], list[str]]:
-    """The rigs whose files are in the folder, which holds ``valimaki2023``, ``euroc_vio`` and the
-    other sets; and the names of the sets that are not.
+    """Load the rigs of all sets in a folder; return them and the names of absent sets.
+
+    The folder contains ``valimaki2023``, ``euroc_vio`` and the folders of the other sets.
     """
     present = [name for name in _LOADERS if (folder / name).is_dir()]
     rigs = [rig for name in present for rig in rigs_of(folder, name)]
@@ -116,11 +122,11 @@ def real_rigs(folder: Path) -> tuple[list[Rig], list[str]]:
 
 
 def rigs_of(folder: Path, name: str) -> list[Rig]:
-    """The rigs of one set."""
+    """Load the rigs of one set."""
     return _LOADERS[name](folder / name)
 
 
-# Good to about 0.15 deg and 10 mm, as the flights say of it among themselves.
+# Published pose of the camera. The results of the flights scatter by about 10 mm and 0.15 deg.
 EUROC = Truth.within(
     np.array(
         [
@@ -178,14 +184,14 @@ def _kitti(folder: Path) -> list[Rig]:
         ),
         "kitti_long": (long / "cam01" / KEYFRAMES, long / "cam23" / KEYFRAMES),
     }
-    # The rectified calibration is what the SLAM saw: the published files differ from it by their
-    # own rectification, 0.03 and 0.45 deg.
+    # The SLAM used rectified images, so the calibration of the rectified images is the truth. The
+    # published calibrations differ from it by 0.03 and 0.45 deg.
     return [
         _single(
             name,
             Recording(*map(read_trajectory, pair)),
             _exact(RECTIFIED[name]),
-            _FOUND,
+            _CLOCK_AND_SCALE_CHECK,
         )
         for name, pair in files.items()
     ]
@@ -200,7 +206,7 @@ _ZXL19 = Truth.within(
 
 
 def zxl19_sensors(folder: Path) -> list[dict[str, Trajectory]]:
-    """INS, lidar odometry and camera of the road vehicle, by name, in each of three recordings."""
+    """Read the trajectories of INS, lidar and camera of a road vehicle, in three recordings."""
     return [
         {
             name: _read(folder / f"bag{bag}/{name}_FCPE.mat", _ZXL19_COLUMNS)
@@ -224,11 +230,11 @@ def _zxl19(folder: Path) -> list[Rig]:
 
     lidars = recordings("INS", "LO")
     cameras = recordings("INS", "VO")
-    # The road is flat: heights are a matter for a tape measure. The lidar leans a little against
-    # the axis of turning, so that without this the unknown height would be part of what is
-    # uncertain of x and y.
-    lidar = {**_FOUND, "prior": {"z": (0.0, 0.3)}}
-    camera = {**_SCALE_FOUND, "prior": {"z": (-0.3, 0.3)}}
+    # The road is flat, so the motion does not determine z, and a prior from a tape measure is
+    # needed. Without this prior, x and y would be uncertain too, because the lidar leans slightly
+    # against the axis about which the vehicle turns.
+    lidar = {**_CLOCK_AND_SCALE_CHECK, "prior": {"z": (0.0, 0.3)}}
+    camera = {**_CLOCK_AND_SCALE, "prior": {"z": (-0.3, 0.3)}}
     return [
         Rig(
             name="zxl19_lidar",
@@ -243,9 +249,11 @@ def _zxl19(folder: Path) -> list[Rig]:
             options=camera,
             is_cut=False,
         ),
-        _refused("zxl19_lidar without z", lidars, _FOUND),
-        _refused("zxl19_camera without z", cameras, _SCALE_FOUND),
-        _refused("zxl19_lidar_camera", recordings("LO", "VO"), _SCALE_FOUND),
+        _refused("zxl19_lidar without z", lidars, _CLOCK_AND_SCALE_CHECK),
+        _refused("zxl19_camera without z", cameras, _CLOCK_AND_SCALE),
+        _refused(
+            "zxl19_lidar_camera", recordings("LO", "VO"), _CLOCK_AND_SCALE
+        ),
     ]
 
 
@@ -255,12 +263,12 @@ _DEVICES = {
     "nero": "NERO_2017-04-06-18-25-25",
 }
 
-# Three devices on one rig, pairwise: the answers of a cycle must close.
+# The three pairs of three devices on one rig. Their extrinsics, chained, must give the identity.
 CYCLE = ("tango_caligula_mars", "tango_mars_nero", "tango_nero_caligula")
 
 
 def tango_devices(folder: Path) -> dict[str, Trajectory]:
-    """The three hand-held devices by name."""
+    """Read the trajectories of the three hand-held devices by name."""
     return {
         name: _read(folder / f"{file}.csv", _ASL_COLUMNS)
         for name, file in _DEVICES.items()
@@ -271,12 +279,18 @@ def _tango(folder: Path) -> list[Rig]:
     devices = tango_devices(folder)
     pairs = {name: name.split("_")[1:] for name in CYCLE}
     return [
-        _single(name, Recording(devices[parent], devices[child]), None, _FOUND)
+        _single(
+            name,
+            Recording(devices[parent], devices[child]),
+            None,
+            _CLOCK_AND_SCALE_CHECK,
+        )
         for name, (parent, child) in pairs.items()
     ]
 
 
-# Of four drives of the same pair of sensors: the middle of their range, and half of it.
+# Translations of the same two sensors in four drives: the middle of their range, and half of the
+# range as standard deviation.
 _PRIMESENSE = Truth.within(
     se3.from_rotation_translation(np.eye(3), [0.066, 0.0415, 0.032]),
     np.array([0.002, 0.0015, 0.002]),
@@ -292,7 +306,7 @@ _ARM = Truth.within(
 def _primesense(folder: Path) -> list[Rig]:
     names = ("vicon_prime_sense", "W_camera_rgb_image_raw")
     recording = _asl(folder, *(f"2017-04-09-18-13-10_{name}" for name in names))
-    return [_single("primesense", recording, _PRIMESENSE, _CLOCK_FOUND)]
+    return [_single("primesense", recording, _PRIMESENSE, _CLOCK)]
 
 
 def _robot_arm(folder: Path) -> list[Rig]:
@@ -300,7 +314,7 @@ def _robot_arm(folder: Path) -> list[Rig]:
     real = _asl(folder, f"{stem}_base_link_sr300_hinge", f"{stem}_target_ir")
     one_axis = _asl(folder, "robot_arm_sim_hand", "robot_arm_sim_camera")
     return [
-        _single("robot_arm", real, _ARM, _CLOCK_FOUND),
+        _single("robot_arm", real, _ARM, _CLOCK),
         _refused("robot_arm about one axis", {"whole": one_axis}, {}),
     ]
 
@@ -356,7 +370,7 @@ def _boreas(folder: Path) -> list[Rig]:
 
 
 def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:
-    """Poses of one INS; its attitude angles are rotations of the frame, hence the signs."""
+    """Read poses of Boreas. Its angles rotate the coordinate frame, so their signs are changed."""
     with open(path, encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -385,7 +399,10 @@ def between(
     last_ns: float,
     stamps_ns: IntArray | None = None,
 ) -> Trajectory:
-    """The poses whose stamps, perhaps given on another clock, lie between two."""
+    """Return the poses whose stamps are between two stamps (ns).
+
+    ``stamps_ns`` are the stamps (N,) to compare; by default, those of the trajectory.
+    """
     stamps_ns = trajectory.stamps_ns if stamps_ns is None else stamps_ns
     return trajectory[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]
 

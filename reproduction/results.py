@@ -1,5 +1,6 @@
-"""What an experiment has solved, and summaries of many runs as in the paper's figures: mean and
-95 % confidence interval, or median and quartiles.
+"""Results of an experiment, and summaries of many runs as in the paper's figures.
+
+A summary is the mean with its 95 % confidence interval, or the median with the quartiles.
 """
 
 from __future__ import annotations
@@ -29,22 +30,21 @@ class Summary:
     centre: float
     low: float
     high: float
-    # The farthest values within 1.5 times the interquartile range of the quartiles.
+    # Of a median: the smallest and the largest value that is at most 1.5 interquartile ranges
+    # outside of the quartiles. Of a mean: the smallest and the largest value.
     whiskers: tuple[float, float]
     # Number of runs.
     n: int
 
 
 def mean_summary(values: ArrayLike) -> Summary:
-    """Mean and 95 % confidence interval of (N,) values."""
+    """Return the mean of values (N,) and its 95 % confidence interval."""
     values = np.asarray(values)
     mean = values.mean()
     n = len(values)
-    half = (
-        stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n)
-        if n > 1
-        else np.inf
-    )
+    half = np.inf
+    if n > 1:
+        half = stdtrit(n - 1, 0.975) * values.std(ddof=1) / np.sqrt(n)
     whiskers = float(values.min()), float(values.max())
     return Summary(
         float(mean), float(mean - half), float(mean + half), whiskers, n
@@ -52,13 +52,11 @@ def mean_summary(values: ArrayLike) -> Summary:
 
 
 def quartile_summary(values: ArrayLike) -> Summary:
-    """Median and quartiles of (N,) values."""
+    """Return the median and the quartiles of values (N,)."""
     values = np.sort(values)
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75))
-    inside = values[
-        (values >= low - 1.5 * (high - low))
-        & (values <= high + 1.5 * (high - low))
-    ]
+    reach = 1.5 * (high - low)
+    inside = values[(values >= low - reach) & (values <= high + reach)]
     whiskers = float(inside[0]), float(inside[-1])
     return Summary(
         float(median), float(low), float(high), whiskers, len(values)
@@ -66,22 +64,20 @@ def quartile_summary(values: ArrayLike) -> Summary:
 
 
 class Table:
-    """Errors of many rows by data set, level, method and reference; m and deg."""
+    """Errors of many rows (m and deg), by data set, level, method and reference.
+
+    Groups of rows with a missing error are left out.
+    """
 
     def __init__(self, rows: pd.DataFrame) -> None:
         keys = ["dataset", "level", "method", "reference"]
-        self._errors = {
-            (
-                dataset,
-                None if np.isnan(level) else level,
-                method,
-                reference,
-            ): errors
-            for (dataset, level, method, reference), group in rows.groupby(
-                keys, dropna=False
-            )
-            if np.isfinite(errors := group[list(METRICS)].to_numpy()).all()
-        }
+        self._errors: dict[tuple[str, float | None, str, str], FloatArray] = {}
+        for key, group in rows.groupby(keys, dropna=False):
+            errors = group[list(METRICS)].to_numpy()
+            if np.isfinite(errors).all():
+                dataset, number, method, reference = key
+                level = None if np.isnan(number) else number
+                self._errors[dataset, level, method, reference] = errors
 
     def values(
         self,
@@ -91,19 +87,18 @@ class Table:
         reference: str,
         metric: str,
     ) -> FloatArray:
-        """(N,) errors of the runs."""
+        """Return the errors (N,) of the runs."""
         return self._errors[dataset, level, method, reference][
             :, METRICS.index(metric)
         ]
 
     def levels(self, dataset: str, method: str) -> tuple[float | None, ...]:
-        """Levels of a data set, ascending; (None,) for the mixture."""
-        of_dataset = {
-            key[1]
-            for key in self._errors
-            if (key[0], key[2]) == (dataset, method)
-        }
-        return tuple(sorted(of_dataset, key=lambda level: level or 0.0))
+        """Return the levels of a data set, ascending; (None,) for the mixture."""
+        levels = set()
+        for dataset_of_key, level, method_of_key, _ in self._errors:
+            if (dataset_of_key, method_of_key) == (dataset, method):
+                levels.add(level)
+        return tuple(sorted(levels, key=lambda level: level or 0.0))
 
     def summary(
         self,
@@ -113,7 +108,7 @@ class Table:
         reference: str,
         metric: str,
     ) -> Summary:
-        """As the paper does: the mixture by quartiles, the others by mean."""
+        """Summarise as the paper does: the mixture by quartiles, other data sets by the mean."""
         values = self.values(dataset, level, method, reference, metric)
         return (
             quartile_summary(values)
@@ -124,8 +119,10 @@ class Table:
     def score(
         self, dataset: str, method: str, reference: str, metric: str = "e_at"
     ) -> float:
-        """The value that variants are compared by: the mean over levels of the mean over runs; of
-        the mixture, the median.
+        """Return the value by which variants are compared.
+
+        It is the mean of the runs, averaged over the levels; for the mixture, the median of the
+        runs.
         """
         levels = self.levels(dataset, method)
         summaries = [
@@ -137,7 +134,7 @@ class Table:
     def ranking(
         self, dataset: str, method: str, metric: str = "e_at"
     ) -> list[str]:
-        """References from the smallest score to the largest."""
+        """Return the references from the smallest to the largest score."""
         return sorted(
             REFERENCES,
             key=lambda name: self.score(dataset, method, name, metric),
@@ -146,7 +143,7 @@ class Table:
     def best_reference(
         self, dataset: str, method: str, metric: str = "e_at"
     ) -> str:
-        """The reference with the smallest score."""
+        """Return the reference with the smallest score."""
         return self.ranking(dataset, method, metric)[0]
 
 
@@ -157,7 +154,7 @@ class Results:
     source: Source
     rows: pd.DataFrame
     out: Path
-    # Number of processes of the studies, which are not solved cell by cell.
+    # Number of processes for artefacts that are not solved by cells, such as the certificate.
     jobs: int = 1
 
     @cached_property
@@ -174,7 +171,7 @@ class Results:
         )
 
     def of(self, dataset: str, method: str) -> pd.DataFrame:
-        """Rows of a method on a data set."""
+        """Return the rows of a method on a data set."""
         return self.rows[
             (self.rows["dataset"] == dataset) & (self.rows["method"] == method)
         ]

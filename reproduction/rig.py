@@ -1,7 +1,7 @@
-"""``python -m reproduction.rig``: several sensors of one simulated rig.
+"""``python -m reproduction.rig``: calibrate several sensors of a simulated rig.
 
-It drives over hills. Every pose of every sensor has an error of its own, and every
-motion one that stays. Their sizes and the extrinsics are known.
+The rig drives over hills. The poses of every sensor have white noise and a random walk. The sizes
+of both, and the extrinsics, are known.
 """
 
 import dataclasses
@@ -17,17 +17,26 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.extras.rig.rig import calibrate_rig
 from hand_eye_calib.extras.simulation.drive import simulate_drive
 from hand_eye_calib.extras.simulation.options import HILLY_DRIVE
-from reproduction.partial import QUANTILE_90
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.writing import markdown_table, show, study_parser
 
-# Errors per axis of the first sensor: white noise (m, rad), then random walk from pose to pose (m,
-# rad).
+# Standard deviations of a sensor's errors per axis: white noise (m, rad), then random walk from
+# pose to pose (m, rad).
 _ERRORS = np.array([4e-3, 2e-3, 1e-3, 5e-4])
 
 
 class Rig(NamedTuple):
-    """A simulated rig: stamps (N,), poses (S, N, 4, 4), extrinsics (S, 4, 4) and sigmas (S, 4) of
-    the errors.
+    """A simulated rig of S sensors with N poses each.
+
+    Attributes
+    ----------
+    stamps_ns : (N,) int64 array
+    poses : (S, N, 4, 4) array
+        Measured poses.
+    Xs : (S, 4, 4) array
+        True extrinsics: the pose of each sensor in the first sensor.
+    errors : (S, 4) array
+        Standard deviations of the errors, in the order of ``_ERRORS``.
     """
 
     stamps_ns: IntArray
@@ -37,7 +46,7 @@ class Rig(NamedTuple):
 
 
 def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
-    """A drive with sensors whose errors have sigmas (S, 4)."""
+    """Simulate a drive with sensors whose errors have the standard deviations ``errors`` (S, 4)."""
     random = np.random.default_rng((21, seed))
     drive = dataclasses.replace(
         HILLY_DRIVE, poses=n_poses, child_rate=10.0, child_delay=0.0
@@ -47,41 +56,37 @@ def simulated(seed: int, n_poses: int, errors: FloatArray) -> Rig:
     poses = []
     for sensor, (white_m, white_rad, walk_m, walk_rad) in enumerate(errors):
         if sensor > 0:
-            Xs.append(
-                se3.exp(
-                    np.r_[random.uniform(-1, 1, 3), random.normal(0, 0.7, 3)]
-                )
-            )
-        true = parent.poses @ Xs[sensor]
-        steps = (
-            se3.inverse(true[:-1])
-            @ true[1:]
-            @ _errors(random, n_poses - 1, walk_m, walk_rad)
-        )
-        driven = [true[0]]
+            translation = random.uniform(-1, 1, 3)
+            rotation_vector = random.normal(0, 0.7, 3)
+            Xs.append(se3.exp(np.r_[translation, rotation_vector]))
+        true_poses = parent.poses @ Xs[sensor]
+        true_steps = se3.inverse(true_poses[:-1]) @ true_poses[1:]
+        steps = true_steps @ _errors(random, n_poses - 1, walk_m, walk_rad)
+        drifting = [true_poses[0]]
         for step in steps:
-            driven.append(driven[-1] @ step)
-        poses.append(
-            np.array(driven) @ _errors(random, n_poses, white_m, white_rad)
-        )
+            drifting.append(drifting[-1] @ step)
+        white = _errors(random, n_poses, white_m, white_rad)
+        poses.append(np.array(drifting) @ white)
     return Rig(parent.stamps_ns, np.array(poses), np.array(Xs), errors)
 
 
 def _errors(
     random: np.random.Generator, n: int, metres: float, radians: float
 ) -> FloatArray:
+    """Draw transforms (n, 4, 4) near the identity, with these standard deviations per axis."""
     sigmas = np.repeat([metres, radians], 3)
     return se3.exp(random.standard_normal((n, 6)) * sigmas)
 
 
 def alike(n_sensors: int) -> FloatArray:
-    """Sigmas of sensors of one make."""
+    """Return the standard deviations (S, 4) of sensors with equal errors."""
     return np.tile(_ERRORS, (n_sensors, 1))
 
 
 def unequal(n_sensors: int) -> FloatArray:
-    """Sigmas of which the last sensor's are twice the first one's in translation, and half in
-    rotation.
+    """Return standard deviations (S, 4) that change from the first to the last sensor.
+
+    Those of translations grow by a factor of two, those of rotations decrease by a factor of two.
     """
     larger = np.linspace(1.0, 2.0, n_sensors)
     smaller = larger[::-1]
@@ -90,9 +95,18 @@ def unequal(n_sensors: int) -> FloatArray:
 
 
 class Outcome(NamedTuple):
-    """One simulated rig: errors (P, 6) of all pairs of sensors in sigmas, squared errors of the rig
-    and of the answers for neighbours alone (S - 2, 6), by how much the answers for two sensors at a
-    time miss closing (m).
+    """Errors of the calibration of a simulated rig with S sensors and P pairs of sensors.
+
+    Attributes
+    ----------
+    in_sigmas : (P, 6) array
+        Errors of all pairs of sensors, divided by their standard deviations.
+    squares : (S - 2, 6) array
+        Squared errors of neighbours without the first sensor, from the rig.
+    pairwise_squares : (S - 2, 6) array
+        Squared errors of the same neighbours, each calibrated alone.
+    closes_m : float
+        Largest misclosure of pairwise extrinsics around a cycle of sensors, m.
     """
 
     in_sigmas: FloatArray
@@ -102,37 +116,37 @@ class Outcome(NamedTuple):
 
 
 def outcome(rig: Rig) -> Outcome:
-    """Calibrate a rig, all its extrinsics against the truth."""
+    """Calibrate a rig, and compare all its extrinsics with the truth."""
     names = [f"s{index}" for index in range(len(rig.Xs))]
     calibration = calibrate_rig(trajectories_of(rig, names))
     errors = {}
-    own = []
+    variances = []
     for first, second in combinations(range(len(names)), 2):
-        back = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
-        errors[first, second] = se3.log(
-            back @ calibration.T(names[first], names[second])
+        T = calibration.T(names[first], names[second])
+        T_true_inverse = se3.inverse(rig.Xs[second]) @ rig.Xs[first]
+        errors[first, second] = se3.log(T_true_inverse @ T)
+        covariance = calibration.covariance_measured(
+            names[first], names[second]
         )
-        own.append(
-            np.diag(
-                calibration.covariance_measured(names[first], names[second])
-            )
-        )
-    pairwise = [
-        se3.log(
-            se3.inverse(rig.Xs[at + 1]) @ rig.Xs[at] @ neighbour.T_parent_child
-        )
-        for at, neighbour in enumerate(calibration.neighbours, start=1)
+        variances.append(np.diag(covariance))
+    pairwise = []
+    for sensor, neighbour in enumerate(calibration.neighbours, start=1):
+        T_true_inverse = se3.inverse(rig.Xs[sensor + 1]) @ rig.Xs[sensor]
+        pairwise.append(se3.log(T_true_inverse @ neighbour.T_parent_child))
+    of_neighbours = [
+        errors[sensor, sensor + 1] for sensor in range(1, len(names) - 1)
     ]
+    misclosures_m = [closure.translation_m for closure in calibration.closures]
     return Outcome(
-        np.array([*errors.values()]) / np.sqrt(own),
-        np.array([errors[at, at + 1] for at in range(1, len(names) - 1)]) ** 2,
-        np.array(pairwise) ** 2,
-        max(closure.translation_m for closure in calibration.closures),
+        in_sigmas=np.array([*errors.values()]) / np.sqrt(variances),
+        squares=np.array(of_neighbours) ** 2,
+        pairwise_squares=np.array(pairwise) ** 2,
+        closes_m=max(misclosures_m),
     )
 
 
 def trajectories_of(rig: Rig, names: Sequence[str]) -> dict[str, Trajectory]:
-    """The trajectories of all sensors by name."""
+    """Return the trajectories of all sensors by name."""
     return {
         name: Trajectory(rig.stamps_ns, poses)
         for name, poses in zip(names, rig.poses, strict=True)
@@ -140,7 +154,7 @@ def trajectories_of(rig: Rig, names: Sequence[str]) -> dict[str, Trajectory]:
 
 
 def simulated_table(repeats: int, n_poses: int) -> str:
-    """A row for every kind and number of sensors."""
+    """Return a table with a row for equal and unequal sensors, three and five of them."""
     rows = []
     for name, errors_of in (("alike", alike), ("unequal", unequal)):
         for n_sensors in (3, 5):
@@ -154,26 +168,34 @@ def simulated_table(repeats: int, n_poses: int) -> str:
 
 
 def _row(outcomes: Sequence[Outcome]) -> dict[str, str]:
-    squares, pairwise = (
-        np.array([getattr(draw, name) for draw in outcomes]).mean(axis=0)
-        for name in ("squares", "pairwise_squares")
+    squares = np.mean([outcome.squares for outcome in outcomes], axis=0)
+    pairwise = np.mean(
+        [outcome.pairwise_squares for outcome in outcomes], axis=0
     )
-    misclosures_m = [draw.closes_m for draw in outcomes]
+    ratio = np.sqrt(np.mean(squares / pairwise))
+    misclosures_m = [outcome.closes_m for outcome in outcomes]
     inside = np.mean(
-        [np.abs(draw.in_sigmas) < QUANTILE_90 for draw in outcomes]
+        [np.abs(outcome.in_sigmas) < HALF_WIDTH_90 for outcome in outcomes]
     )
     return {
-        "Neighbours: error / own answer": f"{np.sqrt(np.mean(squares / pairwise)):.2f}",
+        "Neighbours: error / pairwise error": f"{ratio:.2f}",
         "Within 90 % interval": f"{100 * inside:.0f} %",
-        "Answers miss closing by (mm)": f"{1e3 * np.median(misclosures_m):.2f}",
+        "Misclosure (mm)": f"{1e3 * np.median(misclosures_m):.2f}",
     }
 
 
 def main() -> None:
-    """Simulate, calibrate and write."""
+    """Simulate rigs, calibrate them, and print the table."""
     parser = study_parser("reproduction.rig", __doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--poses", type=int, default=1200)
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="drives of each row. Default: 5"
+    )
+    parser.add_argument(
+        "--poses",
+        type=int,
+        default=1200,
+        help="poses of a drive. Default: 1200",
+    )
     arguments = parser.parse_args()
     show(
         arguments.page,

@@ -1,4 +1,4 @@
-"""One row of results per (case, method, reference): ours, the published one, whether they agree."""
+"""Rows of results by case, method and reference: our errors, published errors, and agreement."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ METRICS = ("e_rt", "e_rR", "e_at", "e_aR")
 PUBLISHED = tuple(f"published_{metric}" for metric in METRICS)
 UNITS = {"e_rt": "m", "e_rR": "deg", "e_at": "m", "e_aR": "deg"}
 
-# The published simulation results of Ali come from a quaternion that was not normalised; under this
-# name we do the same.
+# Our copy of the variant of Ali behind the published simulation results, whose quaternion is not
+# normalised.
 ALI_AS_PUBLISHED = "ali_as_published"
 TITLES = {
     "ali": "Ali",
@@ -37,31 +37,33 @@ TITLES = {
     "zhuang": "Zhuang",
 }
 _COLUMNS = (
-    *(
-        "dataset",
-        "level",
-        "run",
-        "method",
-        "reference",
-        "converged",
-        "T_parent_child",
-    ),
-    *(*METRICS, "objective", *PUBLISHED, "published_objective"),
+    "dataset",
+    "level",
+    "run",
+    "method",
+    "reference",
+    "converged",
+    "T_parent_child",
+    *METRICS,
+    "objective",
+    *PUBLISHED,
+    "published_objective",
 )
 
-# Errors agree within this share of the published one, or this many metres or degrees.
+# Errors agree if they differ by less than this share of the published error ...
 _RELATIVE = 1e-3
+# ... or by less than this (m or deg).
 _ABSOLUTE = 1e-6
 
-# An objective is larger than another if the difference exceeds this share of the other plus the
-# rounding of a perfect fit.
+# An objective is larger than another if it exceeds it by more than this share of the other ...
 _OBJECTIVE_SHARE = 1e-6
+# ... plus this rounding of a perfect fit.
 _OBJECTIVE_FLOOR = 1e-15
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Unit of solving and storing: all runs and references of a method at a level of a data set."""
+    """All runs and references of a method at a level of a data set; solved as a unit."""
 
     dataset: str
     level: float | None
@@ -69,7 +71,7 @@ class Cell:
 
 
 def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
-    """Cells of data sets at all levels, by method in turn."""
+    """Return the cells of data sets at all levels, for all methods."""
     return [
         Cell(dataset, level, method)
         for dataset in datasets
@@ -79,7 +81,7 @@ def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
 
 
 def solve_cell(source: Source, cell: Cell) -> list[dict[str, Any]]:
-    """Plain values of every row of a cell, by run and reference."""
+    """Solve a cell; return its rows by run and reference, as plain values."""
     return [
         _solve(case, cell.method, reference)
         for case in _cases(source, cell.dataset, cell.level)
@@ -87,20 +89,19 @@ def solve_cell(source: Source, cell: Cell) -> list[dict[str, Any]]:
     ]
 
 
-# A process solves the methods of one level in turn.
+# Successive cells of a process are different methods on the same cases.
 @lru_cache(maxsize=1)
 def _cases(source: Source, dataset: str, level: float | None) -> list[Case]:
     return source.cases(dataset, level)
 
 
 def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
+    """Solve a case; return a row with our errors and, if there are any, the published errors."""
     pairs = case.pairs(reference)
-    solve = (
-        ali_as_published.solve
-        if method == ALI_AS_PUBLISHED
-        else Method(method).solve
-    )
-    solution = solve(pairs)
+    if method == ALI_AS_PUBLISHED:
+        solution = ali_as_published.solve(pairs)
+    else:
+        solution = Method(method).solve(pairs)
     errors_of_solution = errors(
         pairs, solution.T_parent_child, case.T_parent_child
     )
@@ -125,21 +126,21 @@ def _solve(case: Case, method: str, reference: str) -> dict[str, Any]:
 
 
 def in_m_and_deg(errors: Errors) -> tuple[float, ...]:
-    """The four metrics, rotations in degrees."""
+    """Return the four metrics, with rotations in degrees."""
     units = [1, 180 / np.pi, 1, 180 / np.pi]
     values = np.array(errors) * units
     return tuple(values.tolist())
 
 
 def published_name(method: str) -> str:
-    """Name of a method in the published results."""
+    """Return the name of a method in the published results."""
     return "ali" if method == ALI_AS_PUBLISHED else method
 
 
 def _objective(
     method: str, pairs: MotionPairs, T_parent_child: FloatArray
 ) -> float | None:
-    """Cost of an answer by the formula of dnl and dnlo; None for the other methods."""
+    """Return the cost of an answer, eq. (5), for dnl and dnlo; None for other methods."""
     if method not in ("dnl", "dnlo"):
         return None
     costs = all_pairs.pair_costs(pairs, T_parent_child)
@@ -151,11 +152,12 @@ def _objective(
 
 
 def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
-    """The rows as a table, with columns for the comparison with the published ones.
+    """Return the rows as a table, with columns for the comparison with the published results.
 
-    ``case``: such as noise/0.002/run_12. ``agrees``, ``same_e_at``: whether all errors, or e_at,
-    are the published ones. ``verdict``, of dnl and dnlo: whether our objective is lower, equal or
-    higher than at the published answer. ``why``: why a row does not agree.
+    ``case`` is a name such as noise/0.002/run_12. ``agrees`` and ``same_e_at``: whether all errors,
+    or e_at, equal the published errors. ``verdict`` (dnl and dnlo): whether our objective is lower
+    than, equal to or higher than the objective at the published answer. ``why`` is the reason why a
+    row does not agree.
     """
     table = pd.DataFrame(rows, columns=list(_COLUMNS))
     numbers = [
@@ -166,17 +168,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
         "published_objective",
     ]
     table[numbers] = table[numbers].astype(float)
-    table["case"] = [
-        "/".join(
-            [
-                *path_to(
-                    row.dataset, None if np.isnan(row.level) else row.level
-                ),
-                row.run,
-            ]
-        )
-        for row in table.itertuples()
-    ]
+    table["case"] = [_case_name(row) for row in table.itertuples()]
     same = agree(
         table[list(METRICS)].to_numpy(), table[list(PUBLISHED)].to_numpy()
     )
@@ -192,6 +184,7 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     unsettled = (
         "the iteration does not settle: its last step depends on rounding"
     )
+    # The first reason that applies to a row is used.
     reasons = {
         "": table["published_e_at"].isna() | table["agrees"],
         "published answer is not the minimum: ours has the lower objective": table[
@@ -211,12 +204,17 @@ def table_of(rows: Sequence[dict[str, Any]]) -> pd.DataFrame:
     return table
 
 
+def _case_name(row: Any) -> str:
+    level = None if np.isnan(row.level) else row.level
+    return "/".join([*path_to(row.dataset, level), row.run])
+
+
 def agree(ours: FloatArray | float, theirs: FloatArray | float) -> BoolArray:
-    """Whether errors (m or deg) are the same."""
+    """Return whether errors (m or deg) are the same within the tolerances."""
     tolerances = np.maximum(_RELATIVE * np.abs(theirs), _ABSOLUTE)
     return np.abs(ours - theirs) <= tolerances
 
 
 def _is_above(objective: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether objectives are larger by more than rounding."""
+    """Return whether objectives are larger than others by more than rounding."""
     return objective > other * (1 + _OBJECTIVE_SHARE) + _OBJECTIVE_FLOOR

@@ -1,5 +1,6 @@
-"""Tasks on several processes. What is solved can be kept in a file, so that an interrupted study
-goes on.
+"""Run tasks in several processes, and keep their results in a file.
+
+An interrupted study continues with the tasks whose results the file does not contain.
 """
 
 import contextlib
@@ -11,15 +12,15 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-# One thread each: the processes share the cores, and sums are taken in one order whatever the
-# number of cores.
+# Environment variables that limit a process to one thread. The processes share the cores, and the
+# order of sums must not depend on the number of cores.
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def in_parallel(
     function: Callable[..., Any], tasks: Iterable[tuple[Any, ...]], jobs: int
 ) -> Iterator[Any]:
-    """``function(*task)`` of every task on ``jobs`` processes, in the order of tasks."""
+    """Yield ``function(*task)`` of every task, in the order of tasks, from ``jobs`` processes."""
     tasks = list(tasks)
     if jobs == 1 or not tasks:
         yield from (function(*task) for task in tasks)
@@ -38,15 +39,19 @@ def kept(
     tasks: Mapping[str, tuple[Any, ...]],
     jobs: int,
 ) -> dict[str, Any]:
-    """Plain values of ``function(*task)`` by name, of the tasks and of those that the file has from
-    earlier runs. What the file has is not solved again: remove it after a change of the code.
+    """Return ``function(*task)`` by the names of the tasks, and store new results in a file.
+
+    Results must be plain values. Tasks whose result is in the file are not solved again, so remove
+    the file after a change of the code. Results of earlier runs with other names are returned, too.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
+    lines = []
+    if path.exists():
+        lines = path.read_text(encoding="utf-8").splitlines()
     outcomes: dict[str, Any] = {}
-    for line in (
-        path.read_text(encoding="utf-8").splitlines() if path.exists() else ()
-    ):
-        with contextlib.suppress(ValueError):  # a line that was cut off
+    for line in lines:
+        # An interrupted run may have left an incomplete line.
+        with contextlib.suppress(ValueError):
             outcomes |= json.loads(line)
     missing = [name for name in tasks if name not in outcomes]
     results = in_parallel(function, [tasks[name] for name in missing], jobs)

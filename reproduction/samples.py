@@ -1,8 +1,8 @@
-"""Make the samples of the package: ``python -m reproduction.samples``.
+"""Make the sample files of the package: ``python -m reproduction.samples``.
 
-The bag has the poses of the sample files ``lidar.tum`` and ``camera.tum``. The arm is simulated;
-the first lines of its file have the true extrinsic. The robot with two driven wheels and a lidar is
-simulated, too; its truth is in ``docs/tutorials/base_link.md``.
+The bag contains the poses of the sample files ``lidar.tum`` and ``camera.tum``. The arm is
+simulated; the first lines of its file contain the true extrinsic. The robot with two driven wheels
+and a lidar is simulated, too; its true parameters are in ``docs/tutorials/base_link.md``.
 """
 
 import argparse
@@ -30,11 +30,13 @@ from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.trajectory_files.reading import read_trajectory
 from reproduction.machines import Machine, simulate_machine
 
-# The arm: stops, camera on the hand, target on the table (x, y, z in m; rotation vector in rad).
+# Number of stops of the arm. The poses below are x, y, z (m) and a rotation vector (rad).
 N_STOPS = 24
+# Camera on the hand.
 CAMERA_IN_GRIPPER = [0.06, -0.03, 0.09, 0.1, -0.05, 1.5]
+# Target on the table.
 TARGET_IN_BASE = [0.5, 0.05, 0.02, 0.0, 0.0, 0.4]
-# Hand above the target, the camera looks down.
+# Mean pose of the hand: above the target, the camera looks down.
 HAND_IN_BASE = [0.45, 0.0, 0.4, 3.0, 0.05, 0.1]
 # Standard deviations of the hand's positions (m) and rotations (rad) between the stops.
 SPREAD_M = 0.1
@@ -43,9 +45,10 @@ SPREAD_RAD = 0.35
 NOISE = np.repeat([0.0005, 0.001], 3)
 SEED = 1
 
-# The robot: seed, duration of its drive (s), and rows of its wheels that are averaged.
+# Seed of the robot's drive, and its duration (s).
 ROBOT_SEED = 5254
 ROBOT_S = 120.0
+# Number of rows of the simulated wheel data (50 Hz) that are averaged to a row of the file.
 ROBOT_ROWS = 2
 
 
@@ -68,7 +71,7 @@ def write_sample_bag(path: Path) -> None:
 
 
 def write_sample_arm(path: Path) -> None:
-    """Write the stops as easy_handeye2 does."""
+    """Write the stops in the format of easy_handeye2."""
     random = np.random.default_rng(SEED)
     turns = se3.rotation_exp(SPREAD_RAD * random.normal(size=(N_STOPS, 3)))
     T_base_hand = se3_of(HAND_IN_BASE)

@@ -1,8 +1,9 @@
-"""``python -m reproduction.shown_from``: the smallest errors that would have shown, in fresh draws.
+"""``python -m reproduction.shown_from``: are errors of the stated sizes detected?
 
-A result states these sizes of its recording. Here the same drive is recorded again with other
-noise, and errors of these sizes are injected: into the result, the clock, the lengths, and into the
-mount, for which the whole program is the judge. Real recordings are used a second time.
+A result states the sizes of errors that its recording would reveal ("shown from"). This study
+simulates the same drive again with other noise, and injects errors of these sizes into the
+extrinsic, the clock, the lengths and the mount. An injected shift of the mount counts as detected
+if the whole calibration reports it. Real recordings have no second drive, so they are used twice.
 """
 
 import argparse
@@ -32,26 +33,26 @@ from reproduction.writing import markdown_table, seed_of
 _KINDS = [name for name in sorted(CLASSES) if name not in REFUSED]
 # Durations of drives, as multiples of the duration of their class.
 _LENGTHS = (0.5, 1.0, 2.0)
-# Shares of a recording between which the mount shifts.
+# The mount shifts between these shares of a recording.
 _MIDDLE = (0.35, 0.65)
 
 
 class Outcome(NamedTuple):
-    """What the stated sizes of a recording were worth.
+    """Tests of the sizes that the result of a recording states.
 
     Attributes
     ----------
     platform : str
     exceeds : (K,) bool array
-        Whether the true error exceeds the stated one, of each stated axis.
+        For each axis with a stated size: whether the true error exceeds it.
     errors : (K,) bool array
-        Whether an error of the stated size is found, of each stated axis.
+        For each axis with a stated size: whether an injected error of this size is detected.
     streams : (2,) bool array
-        Whether errors of clock and lengths are found.
+        Whether injected errors of the clock and of the lengths are detected.
     shift : (0 or 1,) bool array
-        Whether the program reports a shift of the mount, on one axis at random.
+        Whether the calibration reports an injected shift of the mount, on a random axis.
     cost : float
-        Time of the examination, in solves.
+        Time of the computation of the sizes, divided by the time of a solve.
     is_undetectable : bool
         Whether the verdict has the reason ``undetectable``.
     """
@@ -63,6 +64,16 @@ class Outcome(NamedTuple):
     shift: BoolArray
     cost: float
     is_undetectable: bool
+
+
+# Columns of the table: titles, and fields of an outcome.
+_COLUMNS = {
+    "true error exceeds": "exceeds",
+    "error found": "errors",
+    "clock, lengths found": "streams",
+    "shift reported": "shift",
+    "`undetectable`": "is_undetectable",
+}
 
 
 def of_drive(seed: int) -> Outcome:
@@ -97,7 +108,7 @@ def outcome(
     snapshot = cast(Snapshot, result.recording)
     injection.examine(result, snapshot.resolved)
     examined_s = time.process_time()
-    # The solve contains an examination.
+    # The time of the calibration contains the time of an examination.
     cost = (examined_s - solved_s) / (2.0 * solved_s - start_s - examined_s)
     sizes: Detectability | None = result.parts.get("detectability")
     if sizes is None:
@@ -133,7 +144,11 @@ def _errors_found(
     again: tuple[Trajectory, Trajectory],
     rng: np.random.Generator,
 ) -> tuple[BoolArray, BoolArray]:
-    """Return whether one trial with fresh streams finds errors (6,), and those of streams (2,)."""
+    """Test the stated sizes in a random trial with fresh streams.
+
+    Returns whether injected errors of the extrinsic (6,) and of clock and lengths (2,) are
+    detected. An error is detected if its estimate exceeds the threshold for the scatter of blocks.
+    """
     X = result.T_parent_child
     R = se3.rotation_of(X)
     config = cast(Snapshot, result.recording).resolved.config
@@ -164,7 +179,7 @@ def _errors_found(
         (6, lambda size_s: pairs.child_shifted(late_s - size_s)),
         (7, lambda size: pairs.child_scaled(1.0 + longer + size)),
     ):
-        # The evidence is linear in small errors only, so the judge estimates twice.
+        # The evidence is linear in small errors only, so the error is estimated twice.
         estimate = 0.0
         for _ in range(2):
             changed = injection.evidence_of(change(estimate), X).solve(columns)
@@ -181,7 +196,7 @@ def _shift_found(
     options: dict[str, Any],
     rng: np.random.Generator,
 ) -> BoolArray:
-    """Return whether the program reports a shift of the mount on one of the stated axes."""
+    """Return whether a calibration reports a shift of the mount on one of the stated axes."""
     stated = [axis for axis in AXES if np.isfinite(sizes.shifts[axis])]
     if not stated:
         return np.zeros(0, dtype=bool)
@@ -222,43 +237,37 @@ def table(outcomes: list[Outcome]) -> str:
         chosen = [
             item for item in outcomes if platform in (item.platform, "all")
         ]
-        columns = {
-            "true error exceeds": [item.exceeds for item in chosen],
-            "error found": [item.errors for item in chosen],
-            "clock, lengths found": [item.streams for item in chosen],
-            "shift reported": [item.shift for item in chosen],
-            "`undetectable`": [
-                np.array([item.is_undetectable]) for item in chosen
-            ],
-        }
         row: dict[str, object] = {
             "platform": platform,
             "recordings": len(chosen),
         }
-        for title, parts in columns.items():
-            values = np.concatenate(parts)
-            row[title] = (
-                f"{np.mean(values):.1%} of {len(values)}"
-                if len(values)
-                else "-"
-            )
+        for title, field in _COLUMNS.items():
+            flags = np.hstack([getattr(item, field) for item in chosen])
+            row[title] = "-"
+            if len(flags):
+                row[title] = f"{np.mean(flags):.1%} of {len(flags)}"
         row["cost, solves"] = f"{np.mean([item.cost for item in chosen]):.2f}"
         rows.append(row)
     return markdown_table(rows)
 
 
 def main() -> int:
-    """Simulate, inject and print."""
+    """Simulate drives, inject errors, and print the table."""
     parser = argparse.ArgumentParser(
         prog="python -m reproduction.shown_from", description=__doc__
     )
     parser.add_argument(
-        "--drives", type=int, default=200, help="simulated drives"
+        "--drives",
+        type=int,
+        default=200,
+        help="number of simulated drives. Default: 200",
     )
     parser.add_argument(
-        "--seed", type=int, help="default: another one at every run"
+        "--seed", type=int, help="default: a random seed at every run"
     )
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument(
+        "--jobs", type=int, default=1, help="processes. Default: 1"
+    )
     parser.add_argument(
         "--data-folder", type=Path, help="folder of the real recordings"
     )

@@ -1,5 +1,6 @@
-"""Tables 1 and 2 (best variants on KITTI) and S1-S12 (every reference), against the published and
-the rectified ground truth.
+"""Tables 1 and 2 (best variants on KITTI) and S1-S12 (all references).
+
+Errors are against the published ground truth and against the rectified ground truth.
 """
 
 from pathlib import Path
@@ -28,8 +29,8 @@ VARIANT_TABLES = {
     )
 }
 
-# As printed in the paper: variant; e_rt, e_rR, e_at, e_aR; improvement of e_at and e_aR over B1
-# (none where B1 is the best).
+# Tables 1 and 2 as printed in the paper: best variant; e_rt, e_rR, e_at, e_aR; improvement of e_at
+# and e_aR over B1 (None if B1 is the best variant).
 PRINTED: dict[str, dict[str, tuple[Any, ...]]] = {
     "kitti_short": {
         "ali": ("B5", 0.170, 0.294, 0.342, 0.722, 0.288, -0.056),
@@ -54,19 +55,20 @@ _RECTIFIED = ("rectified: e_at (m)", "rectified: e_aR (deg)")
 _RECTIFIED_GAINS = tuple(f"rectified: {gain}" for gain in _GAINS)
 _COLUMNS = (*_ERRORS, *_GAINS, *_RECTIFIED, *_RECTIFIED_GAINS)
 _NOTE = (
-    "Columns 'rectified' are against the calibration of the rectified images that the SLAM saw; "
-    "the others against the ground truth as published. Gain: error of the method's B1 variant "
-    "less that of this one."
+    "Errors in the columns 'rectified' are against the calibration of the rectified images, which "
+    "the SLAM used. Other errors are against the published ground truth. Gain: error of the "
+    "method's B1 variant minus the error of this variant."
 )
 
-# Printed numbers are the same to three decimals.
+# Largest difference of numbers that are equal when printed with three decimals.
 _SAME_PRINT = 0.00051
 
 
 def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of one drive by method and reference, with two further groups of columns.
+    """Return the rows of one drive by method and reference, with further columns.
 
-    They are the errors against the rectified truth, and the gains over the method's B1 variant.
+    The further columns are the errors against the rectified truth, and the gains over the method's
+    B1 variant.
     """
     truth = RECTIFIED[rows["dataset"].iloc[0]]
     indexed = rows.set_index(["method", "reference"])
@@ -87,7 +89,7 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:
-    """Return the row of each method with the smallest error ``by``, from :func:`with_rectified`."""
+    """Return, for each method, the row of :func:`with_rectified` with the smallest error ``by``."""
     best = []
     for method in METHODS:
         rows_of_method = rows.loc[[method]]
@@ -101,14 +103,12 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
     rows = with_rectified(results.rows[results.rows["dataset"] == dataset])
     best = best_variants(rows)
     smallest = best[[*_ERRORS, *_RECTIFIED]].min()
-    printed = (
-        {"method": f"{TITLES[method]} {reference}"}
-        | {
-            column: _print(row[column], smallest.get(column))
-            for column in _COLUMNS
-        }
-        for (method, reference), row in best.iterrows()
-    )
+    printed = []
+    for (method, reference), row in best.iterrows():
+        line = {"method": f"{TITLES[method]} {reference}"}
+        for column in _COLUMNS:
+            line[column] = _print(row[column], smallest.get(column))
+        printed.append(line)
     table = best[list(_COLUMNS)].reset_index(names=["method", "variant"])
     table["method"] = table["method"].map(TITLES)
     return [
@@ -124,7 +124,7 @@ def write_summary_table(name: str, results: Results) -> list[Path]:
 
 
 def _print(value: float, bold: float | None = None) -> str:
-    """Return a value with three decimals; in bold type if ``bold`` has the same three decimals."""
+    """Return a value with three decimals, in bold type if it equals ``bold`` in three decimals."""
     if np.isnan(value):
         return "-"
     text = f"{value:.3f}"
@@ -143,7 +143,7 @@ def _compare_with_print(
     cells: list[dict[str, Any]] = []
     for method, reference in best.index:
         variant, *numbers = PRINTED[dataset][method]
-        # The printed gains are relative to B1, so its reason explains a difference as well.
+        # Printed gains are relative to B1, so the reason of B1 may explain a difference, too.
         reasons = rows.loc[method].loc[[variant, "B1"], "why"]
         why = "; ".join(dict.fromkeys(reasons))
         for column, number in zip((*_ERRORS, *_GAINS), numbers, strict=True):
@@ -191,14 +191,13 @@ def write_variant_table(name: str, results: Results) -> list[Path]:
     rows = with_rectified(solved).loc[method].loc[list(REFERENCES)]
     columns = [*_ERRORS, *_RECTIFIED]
     best = rows[_ERRORS[2]].idxmin()
-    printed = (
-        {"reference": name}
-        | {
-            column: _print(row[column], row[column] if name == best else None)
-            for column in columns
-        }
-        for name, row in rows.iterrows()
-    )
+    printed = []
+    for reference, row in rows.iterrows():
+        line = {"reference": reference}
+        for column in columns:
+            bold = row[column] if reference == best else None
+            line[column] = _print(row[column], bold)
+        printed.append(line)
     return [
         write_text(
             results.out / f"{name}.md",

@@ -1,6 +1,7 @@
-"""``python -m reproduction.vehicles``: sensors on simulated machines against the truth.
+"""``python -m reproduction.vehicles``: calibrate sensors on simulated machines with wheels.
 
-The machines drive figures of eight for three minutes. Further drives do not determine the pose.
+The machines drive figures of eight for three minutes. The motion of further drives does not
+determine the pose of the sensor, or disturbs the estimate.
 """
 
 import argparse
@@ -14,11 +15,11 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.vehicle.calibrate import calibrate_vehicle
 from hand_eye_calib.offline.cli.main import exit_code_of
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.machines import Machine, simulate_machine
-from reproduction.partial import QUANTILE_90
 from reproduction.writing import counted, markdown_table, seed_of, show
 
-# Machines, and "driving" for a sensor without wheel data.
+# Machines; "driving" is a machine with two driven wheels and without wheel data.
 _MODELS = ("wheels", "steering", "tricycle", "omni", "mecanum", "driving")
 _DEGENERATE = ("straight", "circle", "bend", "left", "spin")
 # Drives that disturb the estimate: machine, course, factor of the slips, and slope of ramps (deg).
@@ -33,7 +34,7 @@ _DISTURBED = {
     "articulated, tight curves": ("articulated", "eights", 1.0, 0.0),
     "articulated, wide curves": ("articulated", "wide", 1.0, 0.0),
 }
-# The verdict must not be USE if an error is beyond this number of standard deviations.
+# A result is wrong if an error exceeds this number of its standard deviations.
 _BEYOND = 3.3
 
 
@@ -47,7 +48,7 @@ class Drive(NamedTuple):
 
     @property
     def ratios(self) -> Mapping[str, float]:
-        """Sizes of the errors in standard deviations, of what is determined."""
+        """Absolute errors divided by their standard deviations, of all determined unknowns."""
         ratios = {}
         for name, error in self.errors.items():
             if np.isfinite(self.sigmas[name]):
@@ -55,10 +56,20 @@ class Drive(NamedTuple):
         return ratios
 
 
-def drive(seed: int, model: str, course: str = "eights") -> Drive:
+def drive(
+    seed: int,
+    model: str,
+    course: str = "eights",
+    slip: float = 1.0,
+    ramp_deg: float = 0.0,
+) -> Drive:
     """Simulate a machine and calibrate its sensor."""
     machine = simulate_machine(
-        seed, "wheels" if model == "driving" else model, course
+        seed,
+        "wheels" if model == "driving" else model,
+        course,
+        slip=slip,
+        ramp_rad=np.radians(ramp_deg),
     )
     wheels = None if model == "driving" else machine.wheels
     result = calibrate_vehicle(machine.sensor, wheels, child_kind="exact")
@@ -71,18 +82,16 @@ def _errors_of(
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return the errors of a result, and their standard deviations, by name."""
     T = result.T_parent_child
-    turn = se3.rotation_of(T) @ se3.rotation_of(machine.T_base_sensor).T
-    errors = dict(
-        x=float(T[0, 3] - machine.T_base_sensor[0, 3]),
-        y=float(T[1, 3] - machine.T_base_sensor[1, 3]),
-        **dict(
-            zip(
-                ("roll", "pitch", "yaw"),
-                se3.rotation_log(turn).tolist(),
-                strict=True,
-            )
-        ),
-    )
+    T_true = machine.T_base_sensor
+    turn = se3.rotation_of(T) @ se3.rotation_of(T_true).T
+    roll, pitch, yaw = se3.rotation_log(turn).tolist()
+    errors = {
+        "x": float(T[0, 3] - T_true[0, 3]),
+        "y": float(T[1, 3] - T_true[1, 3]),
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": yaw,
+    }
     rows = {"x": 0, "y": 1, "roll": 3, "pitch": 4, "yaw": 5}
     sigmas = {name: float(result.sigmas[row]) for name, row in rows.items()}
     wheels = result.parts.get("wheels")
@@ -99,25 +108,13 @@ def _errors_of(
 
 
 def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
-    """Rows of a table: largest errors of x, y and yaw, and verdicts, of each disturbed drive."""
+    """Return a row for each disturbed drive: largest errors of x, y and yaw, and verdicts."""
     rows: list[dict[str, object]] = []
     for name, (model, course, slip, ramp_deg) in _DISTURBED.items():
-        results = []
-        for row in range(n_drives):
-            machine = simulate_machine(
-                seed + row,
-                model,
-                course,
-                slip=slip,
-                ramp_rad=np.radians(ramp_deg),
-            )
-            result = calibrate_vehicle(
-                machine.sensor, machine.wheels, child_kind="exact"
-            )
-            errors, sigmas = _errors_of(result, machine)
-            results.append(
-                Drive(errors, sigmas, result.verdict.value, result.headline)
-            )
+        results = [
+            drive(seed + row, model, course, slip, ramp_deg)
+            for row in range(n_drives)
+        ]
         largest = {
             axis: _with_unit(
                 axis, max(abs(item.errors[axis]) for item in results)
@@ -142,7 +139,7 @@ def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
 
 
 def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
-    """Rows of a table: cover of the 90 % intervals and errors of each unknown."""
+    """Return a row for each unknown: errors, and coverage of the 90 % intervals."""
     rows: list[dict[str, object]] = []
     drives = list(drives)
     for name in drives[0].errors:
@@ -161,7 +158,7 @@ def accuracy(drives: Iterable[Drive]) -> list[dict[str, object]]:
                     name, float(np.quantile(errors, 0.9))
                 ),
                 "Largest": _with_unit(name, float(errors.max())),
-                "90 % intervals cover": f"{np.mean(ratios < QUANTILE_90):.0%}",
+                "90 % intervals cover": f"{np.mean(ratios < HALF_WIDTH_90):.0%}",
                 "Largest, sigma": f"{ratios.max():.1f}",
             }
         )
@@ -184,7 +181,7 @@ def summary(drives: Iterable[Drive]) -> str:
     for item in drives:
         ratios += item.ratios.values()
         n_wrong += item.verdict == "USE" and max(item.ratios.values()) > _BEYOND
-    coverage = np.mean(np.array(ratios) < QUANTILE_90)
+    coverage = np.mean(np.array(ratios) < HALF_WIDTH_90)
     return (
         f"{counted(item.verdict for item in drives)}; the 90 % intervals cover {coverage:.1%} of "
         f"{len(ratios)} errors; USE beyond {_BEYOND} sigma: {n_wrong}"
@@ -192,54 +189,58 @@ def summary(drives: Iterable[Drive]) -> str:
 
 
 def main() -> int:
-    """Simulate, calibrate and print."""
+    """Simulate machines, calibrate their sensors, and print the tables."""
     parser = argparse.ArgumentParser(
         prog="python -m reproduction.vehicles", description=__doc__
     )
     parser.add_argument(
-        "--drives", type=int, default=30, help="drives of each machine"
+        "--drives",
+        type=int,
+        default=30,
+        help="drives of each machine. Default: 30",
     )
     parser.add_argument(
-        "--seed", type=int, help="default: another one at every run"
+        "--seed", type=int, help="default: a random seed at every run"
     )
     arguments = parser.parse_args()
     seed = seed_of(arguments.seed)
     print(f"seeds from {seed}\n")
     for model in _MODELS:
         drives = [drive(seed + row, model) for row in range(arguments.drives)]
-        show(
-            None,
-            {
-                model: f"## {model}\n\n{summary(drives)}\n\n{markdown_table(accuracy(drives))}\n"
-            },
-        )
-    rows = []
-    for course in _DEGENERATE:
-        for model in _MODELS:
-            refused = [
-                drive(seed + row, model, course)
-                for row in range(arguments.drives // 3)
-            ]
-            beyond = [
-                max(item.ratios.values(), default=0.0) > _BEYOND
-                for item in refused
-            ]
-            used = [item.verdict == "USE" for item in refused]
-            rows.append(
-                {
-                    "Course": course,
-                    "Machine": model,
-                    "Verdicts": counted(item.verdict for item in refused),
-                    "USE beyond 3.3": int(np.sum(np.logical_and(beyond, used))),
-                    "Such as": Counter(
-                        item.headline for item in refused
-                    ).most_common(1)[0][0],
-                }
-            )
+        table = markdown_table(accuracy(drives))
+        text = f"## {model}\n\n{summary(drives)}\n\n{table}\n"
+        show(None, {model: text})
+    rows = degenerate(seed, arguments.drives // 3)
     show(None, {"degenerate": markdown_table(rows)})
     rows = disturbed(seed, arguments.drives // 3)
     show(None, {"disturbed": markdown_table(rows)})
     return 0
+
+
+def degenerate(seed: int, n_drives: int) -> list[dict[str, object]]:
+    """Return a row for each course that does not determine the pose, and each machine."""
+    rows: list[dict[str, object]] = []
+    for course in _DEGENERATE:
+        for model in _MODELS:
+            drives = [
+                drive(seed + row, model, course) for row in range(n_drives)
+            ]
+            n_wrong = 0
+            for item in drives:
+                largest = max(item.ratios.values(), default=0.0)
+                n_wrong += item.verdict == "USE" and largest > _BEYOND
+            headlines = Counter(item.headline for item in drives)
+            [(headline, _)] = headlines.most_common(1)
+            rows.append(
+                {
+                    "Course": course,
+                    "Machine": model,
+                    "Verdicts": counted(item.verdict for item in drives),
+                    f"USE beyond {_BEYOND}": n_wrong,
+                    "Most frequent headline": headline,
+                }
+            )
+    return rows
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""CSV and Markdown: files, tables, pages; and the arguments of a study."""
+"""CSV files, Markdown tables and pages, and the command-line arguments of a study."""
 
 import argparse
 import os
@@ -16,7 +16,7 @@ TableRow = Mapping[str, object]
 
 
 def write_csv(path: Path, rows: Iterable[TableRow] | pd.DataFrame) -> Path:
-    """Write a table; returns the path. Numbers keep all digits."""
+    """Write a table with all digits of its numbers, and return the path."""
     table = (
         rows
         if isinstance(rows, pd.DataFrame)
@@ -27,29 +27,30 @@ def write_csv(path: Path, rows: Iterable[TableRow] | pd.DataFrame) -> Path:
 
 
 def write_text(path: Path, *blocks: str) -> Path:
-    """Write blocks of text, an empty line between them; returns the path."""
+    """Write blocks of text, separated by empty lines, and return the path."""
     path.write_text("\n\n".join(filter(None, blocks)) + "\n", encoding="utf-8")
     return path
 
 
 def markdown_table(rows: Iterable[TableRow]) -> str:
-    """A Markdown table; the keys of the first row are the titles."""
+    """Return a Markdown table; the keys of the first row are the titles."""
     rows = list(rows)
     if not rows:
         return "Nothing."
-    lines: list[Iterable[object]] = [
-        rows[0],
-        ["---"] * len(rows[0]),
-        *(r.values() for r in rows),
-    ]
-    return "\n".join(
-        "| " + " | ".join(str(cell) for cell in line) + " |" for line in lines
-    )
+    lines: list[Iterable[object]] = [rows[0], ["---"] * len(rows[0])]
+    lines += [row.values() for row in rows]
+    texts = []
+    for cells in lines:
+        words = " | ".join(str(cell) for cell in cells)
+        texts.append(f"| {words} |")
+    return "\n".join(texts)
 
 
 def put_into_page(page: Path, name: str, text: str) -> None:
-    """Put Markdown, without a heading at its beginning, between the lines ``<!-- NAME: begin -->``
-    and ``<!-- NAME: end -->`` of a page. Raises InputError if it has no such lines.
+    """Put Markdown between the lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->`` of a page.
+
+    A heading at the beginning of the Markdown is removed. Raises InputError if the page has no such
+    lines.
     """
     begin = f"<!-- {name}: begin -->\n"
     end = f"<!-- {name}: end -->"
@@ -68,7 +69,7 @@ def put_into_page(page: Path, name: str, text: str) -> None:
 def study_parser(
     name: str, about: str | None, page: str = "put the tables into this page"
 ) -> argparse.ArgumentParser:
-    """Parser of a study: recordings, and a page for its tables."""
+    """Return the parser of a study, with options for the recordings and the page of its tables."""
     parser = argparse.ArgumentParser(
         prog=f"python -m {name}",
         description=about,
@@ -81,15 +82,37 @@ def study_parser(
         metavar="DIR",
         type=Path,
         default=Path(folder) if folder else None,
-        help="folder of the real recordings (valimaki2023, euroc_vio, ...); without it, simulated "
-        "ones only. Default: $HAND_EYE_CALIB_DATA",
+        help="folder of the real recordings (valimaki2023, euroc_vio, ...); without the folder, "
+        "only simulated recordings are used. Default: $HAND_EYE_CALIB_DATA",
     )
     parser.add_argument("--page", metavar="FILE", type=Path, help=page)
     return parser
 
 
+def add_seed_options(parser: argparse.ArgumentParser, count: int) -> None:
+    """Add ``--seeds`` (by default ``count``) and ``--first-seed`` to a parser."""
+    parser.add_argument(
+        "--seeds",
+        type=int,
+        default=count,
+        help="recordings of each row and kind of motion. Default: %(default)s",
+    )
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=0,
+        help="seed of the first recording. Default: 0",
+    )
+
+
+def seeds_of(arguments: argparse.Namespace) -> range:
+    """Return the seeds for the options of :func:`add_seed_options`."""
+    first = arguments.first_seed
+    return range(first, first + arguments.seeds)
+
+
 def seed_of(seed: int | None) -> int:
-    """The seed that is given, or another one at every run."""
+    """Return the given seed, or a random seed if there is none."""
     if seed is not None:
         return seed
     state = np.random.SeedSequence().generate_state(1)
@@ -105,7 +128,7 @@ def show(page: Path | None, tables: Mapping[str, str]) -> None:
 
 
 def percent(count: int, whole: int) -> str:
-    """Such as "4328 of 4332 (99.91 %)", rounded down: only all is 100 %."""
+    """Return text such as "4328 of 4332 (99.91 %)", rounded down so that only all are 100 %."""
     share = 0.0
     if whole:
         share = int(1e4 * count / whole) / 100
@@ -113,7 +136,7 @@ def percent(count: int, whole: int) -> str:
 
 
 def counted(words: Iterable[str], most: int | None = None) -> str:
-    """Words with how often they occur, the most frequent first."""
+    """Return words with their numbers of occurrences, the most frequent word first."""
     return ", ".join(
         f"{word} {count}" for word, count in Counter(words).most_common(most)
     )
@@ -122,6 +145,6 @@ def counted(words: Iterable[str], most: int | None = None) -> str:
 def triple(
     values: Iterable[float], factor: float = 1.0, form: str = ".1f"
 ) -> str:
-    """Numbers times a factor, a comma between them."""
+    """Return numbers, multiplied by a factor, as text with commas."""
     words = [f"{factor * value:{form}}" for value in values]
     return ", ".join(words)

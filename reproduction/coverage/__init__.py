@@ -1,1 +1,1 @@
-"""The coverage study."""
+"""Coverage study: errors against the Cramer-Rao bound, and coverage of the stated intervals."""

@@ -1,6 +1,7 @@
-"""``python -m reproduction.coverage``: do the stated uncertainties hold, and how close are the
-errors to the least possible? On simulated recordings with the Cramer-Rao bound, and on real ones
-with known answers.
+"""``python -m reproduction.coverage``: do the stated intervals contain the true values?
+
+Simulated recordings are also compared with the Cramer-Rao bound, the smallest possible covariance.
+Real recordings have known extrinsics, or are calibrated several times.
 """
 
 import os
@@ -31,12 +32,12 @@ TABLES = (
     "refused",
 )
 
-# Table, function and its arguments, the method among them, of a row.
+# Task that measures a row: its table, a function, and the arguments of the function.
 _Task = tuple[Any, ...]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study; returns the exit code."""
+    """Run the study, and return the exit code."""
     parser = study_parser(
         "reproduction.coverage", __doc__, page="write the page there"
     )
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add(
         "--seed",
         type=int,
-        help="of the first of them. Default: another one at every run",
+        help="seed of the first recording. Default: a random seed at every run",
     )
     add("--jobs", type=int, default=os.cpu_count() or 1, help="processes")
     add("--rows", metavar="FILE", type=Path, help="write all rows there (CSV)")
@@ -105,7 +106,7 @@ def _record_of(row: Row) -> dict[str, object]:
 def measure(
     tasks: Sequence[_Task], methods: Sequence[str], jobs: int
 ) -> list[Row]:
-    """Rows of every class, level, rig and cycle, then the pooled ones."""
+    """Return the rows of all tasks, then the pooled rows; rows without values are left out."""
     rows: list[Row] = [*in_parallel(call, [task[1:] for task in tasks], jobs)]
     rows += [
         pooled(table, name, method, rows)
@@ -118,7 +119,7 @@ def measure(
 def tasks_of(
     method: str, seeds: range, rigs: Sequence[Rig], folder: Path | None
 ) -> list[_Task]:
-    """What is to be measured of a method."""
+    """Return the tasks of a method."""
     tasks: list[_Task] = [
         ("simulated", scores.class_row, name, method, seeds) for name in CLASSES
     ]
@@ -134,7 +135,7 @@ def tasks_of(
 
 
 def _tasks_of_levels(method: str, folder: Path) -> list[_Task]:
-    """Levels of the published simulated data; none if the folder is absent."""
+    """Return the tasks of the published simulated data; none if the folder is absent."""
     if not folder.is_dir():
         return []
     return [
@@ -145,7 +146,7 @@ def _tasks_of_levels(method: str, folder: Path) -> list[_Task]:
 
 
 def _tasks_of_rig(method: str, rig: Rig) -> list[_Task]:
-    """Measures of the recordings of a real rig."""
+    """Return the tasks of the recordings of a real rig."""
     names = list(rig.recordings)
     if rig.is_refused:
         return [

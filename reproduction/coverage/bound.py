@@ -1,9 +1,13 @@
 """The Cramer-Rao bound of an extrinsic under the true noise, exact to first order.
 
-With ``c = Ad(X^-1) a - b`` (a, b: errors of both sensors' poses) a recording shows
-``z_i = c_i + d_i + xi``. Here ``d_i = Ad(B_i^-1) d_{i-1} + walk`` holds the unknown pose of one
-world in the other and the drift of odometry. That is a linear state space: its information matrix
-is block tridiagonal, and one band Cholesky factorisation eliminates all but xi.
+The model of the difference ``z_i`` of both sensors at pose i is::
+
+    z_i = c_i + d_i + xi,    c = Ad(X^-1) a - b,    d_i = Ad(B_i^-1) d_{i-1} + walk
+
+xi is the error of the extrinsic X; a and b are the errors of the poses of parent and child. The
+state d contains the unknown pose of one world in the other, and the drift of the odometry. B_i is
+the child's motion to pose i. This is a linear state space: its information matrix is block
+tridiagonal, and one band Cholesky factorisation eliminates all unknowns except xi.
 """
 
 from collections.abc import Sequence
@@ -27,20 +31,30 @@ _LEAST_VARIANCE = 1e-18
 
 @dataclass(frozen=True)
 class Side:
-    """One sensor."""
+    """A sensor: its error model, drawn errors and true poses."""
 
     errors: SensorErrors
     drawn: DrawnErrors
     # True poses; (N, 4, 4) array.
     Ts: FloatArray
-    # Takes its errors into c: Ad(X^-1) of the parent, -I of the child; (6, 6) array.
+    # Maps the sensor's errors to c: Ad(X^-1) for the parent, -I for the child; (6, 6) array.
     to_error: FloatArray
 
 
 @dataclass(frozen=True)
 class _Latent:
-    """A latent process: its transition, stationary variances (k,), and where it enters: the error
-    of each pose (N, 6, k), and the increments (N-1, 6, k).
+    """A latent process with k states.
+
+    Attributes
+    ----------
+    phi : float
+        Transition factor from pose to pose.
+    variances : (k,) array
+        Stationary variances.
+    in_pose : (N, 6, k) array
+        Effect of the states on the error of each pose.
+    in_step : (N-1, 6, k) array
+        Effect of the states on the error of each increment.
     """
 
     phi: float
@@ -65,8 +79,9 @@ class _StateSpace:
 def cramer_rao_bound(
     sides: Sequence[Side], child: FloatArray, dt: float
 ) -> FloatArray:
-    """Least covariance (6, 6) of xi in ``X Exp(xi)``, (rho, phi), child frame, of any unbiased
-    estimator.
+    """Return the smallest covariance (6, 6) of xi in ``X Exp(xi)`` of any unbiased estimator.
+
+    xi is (rho, phi) in the child frame.
 
     Parameters
     ----------
@@ -84,14 +99,14 @@ def cramer_rao_bound(
 def ideal_estimate(
     sides: Sequence[Side], child: FloatArray, dt: float, z: FloatArray
 ) -> FloatArray:
-    """The estimate (6,) of xi that attains the bound: least squares under the true noise.
+    """Return the estimate (6,) of xi that attains the bound: least squares under the true noise.
 
     Parameters
     ----------
     sides, child, dt
         As for :func:`cramer_rao_bound`.
     z : (N, 6) array
-        What the recording shows, see the module.
+        Differences of both sensors at each pose, see the model of this module.
     """
     equations = normal_equations(sides, child, dt, z)
     information = equations[:-1, :-1]
@@ -107,8 +122,10 @@ def normal_equations(
     dt: float,
     z: FloatArray | None = None,
 ) -> FloatArray:
-    """Information on xi, behind it on the pose of the worlds if odometry does not drift, and the
-    right-hand side as last column if z is given.
+    """Return the normal equations of the unknowns, after the states are eliminated.
+
+    The unknowns are xi (6) and, if no odometry drifts, the pose (6) of one world in the other. If
+    ``z`` is given, the last row and column belong to the right-hand side.
     """
     n_poses = len(child)
     white: FloatArray = np.zeros((6, 6))
@@ -137,6 +154,7 @@ def normal_equations(
 
 
 def _latents(side: Side, dt: float) -> list[_Latent]:
+    """Return the latent processes of a sensor: slow errors, and the drifting scale."""
     errors = side.errors
     Ts = side.Ts
     to_error = side.to_error
@@ -167,7 +185,7 @@ def _phi(dt: float, tau_s: float) -> float:
 def _drifting(
     adjoints: FloatArray, walk_inverse: FloatArray, latents: list[_Latent]
 ) -> _StateSpace:
-    """States (d, latents), d a random walk of unknown start."""
+    """Return the state space of d, a random walk with unknown start, and the latent processes."""
     n_steps = len(adjoints)
     size = 6 + sum(len(latent.variances) for latent in latents)
     F = np.zeros((n_steps, size, size))
@@ -192,7 +210,7 @@ def _drifting(
 
 
 def _stationary(count: int, latents: list[_Latent]) -> _StateSpace:
-    """States (latents) alone, none of them in the increments."""
+    """Return the state space of the latent processes alone; none of them affects increments."""
     phis = [np.zeros(0)]
     variances = [np.zeros(0)]
     in_poses = [np.zeros((count, 6, 0))]
@@ -224,7 +242,7 @@ def _inverse(variances: FloatArray) -> FloatArray:
 def _eliminated(
     weights: FloatArray, columns: FloatArray, space: _StateSpace
 ) -> FloatArray:
-    """Gram matrix (p, p) of columns (N, 6, p) after eliminating the states."""
+    """Return the weighted Gram matrix (p, p) of columns (N, 6, p), with the states eliminated."""
     n_columns = columns.shape[2]
     gram = np.einsum(
         "nji,njk,nkl->il", columns, weights, columns, optimize=True
@@ -249,7 +267,10 @@ def _eliminated(
 
 
 def _banded(diagonal: FloatArray, below: FloatArray) -> FloatArray:
-    """Lower band storage of a symmetric block tridiagonal matrix."""
+    """Return the lower band storage of a symmetric block tridiagonal matrix.
+
+    ``diagonal`` (N, s, s) are its diagonal blocks, ``below`` (N-1, s, s) the blocks below them.
+    """
     n_poses, size, _ = diagonal.shape
     bands = np.zeros((2 * size, n_poses * size))
     end = (n_poses - 1) * size

@@ -1,4 +1,4 @@
-"""Simulated recordings of many kinds, each with its Cramer-Rao bound."""
+"""Classes of simulated recordings, and the Cramer-Rao bound of each recording."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ _START_NS = 1_700_000_000_000_000_000
 
 @dataclass(frozen=True)
 class RecordingClass:
-    """How the recordings of a class are made."""
+    """Motion, errors and size of the recordings of a class."""
 
     duration_s: float
     rate_hz: float
@@ -33,7 +33,7 @@ class RecordingClass:
     child: SensorErrors
     # ``motion(rng, duration_s)``.
     motion: Callable[[np.random.Generator, float], motions.Motion]
-    # Length of the extrinsic's translation; its direction is drawn.
+    # Length of the extrinsic's translation (m); its direction is drawn.
     lever_m: float = 0.4
 
 
@@ -50,8 +50,9 @@ class Simulated:
     dt: float
 
     def bound(self) -> FloatArray:
-        """Cramer-Rao bound (6, 6) of xi in ``X Exp(xi)``, (rho, phi), child frame, under the true
-        noise. The instants of jumps and bursts count as known.
+        """Return the Cramer-Rao bound (6, 6) of xi in ``X Exp(xi)`` under the true noise.
+
+        xi is (rho, phi) in the child frame. The instants of jumps and bursts count as known.
         """
         return cramer_rao_bound(self.sides, self.sides[1].Ts, self.dt)
 
@@ -62,9 +63,10 @@ def simulate(
     T_parent_child: FloatArray | None = None,
     noise_seed: tuple[int, ...] | None = None,
 ) -> Simulated:
-    """One recording; the same seed gives the same. The extrinsic is drawn if it is not given.
+    """Simulate a recording of a class; equal seeds give equal recordings.
 
-    Another ``noise_seed`` gives other errors of the sensors on the same drive.
+    The extrinsic is drawn if it is not given. A ``noise_seed`` changes the errors of the sensors,
+    not the drive.
     """
     generators = np.random.default_rng(seed).spawn(4)
     motion_rng, mount_rng, parent_rng, child_rng = generators
@@ -97,18 +99,18 @@ def simulate(
 
 
 def stamps_ns(times_s: FloatArray) -> IntArray:
-    """Stamps (N,) of times since the start of a recording."""
+    """Return stamps (N,) for times (N,) since the start of a recording, s."""
     return _START_NS + np.round(times_s * 1e9).astype(np.int64)
 
 
 def make(name: str, seed: int) -> Simulated:
-    """The recording of a class by this seed."""
+    """Simulate the recording of a class with this seed."""
     class_number = sorted(CLASSES).index(name)
     return simulate(CLASSES[name], (seed, class_number))
 
 
 def _mount(rng: np.random.Generator, lever_m: float) -> FloatArray:
-    """Any rotation, and a translation of this length, mostly level."""
+    """Draw an extrinsic: any rotation, and a translation of this length that is mostly level."""
     direction = rng.standard_normal(3) * [1.0, 1.0, 0.5]
     length = np.linalg.norm(direction)
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
@@ -138,7 +140,10 @@ def _white(metres: float, degrees: float) -> SensorErrors:
 
 
 def slam(tau_s: float, metres: float, degrees: float) -> SensorErrors:
-    """SLAM: errors of a map that last for so long."""
+    """Return the errors of a SLAM: white noise, and errors of the map (m, deg).
+
+    ``tau_s`` is the correlation time of the errors of the map, s.
+    """
     return _slow(_white(0.008, 0.03), tau_s, metres, degrees, in_world=True)
 
 
@@ -333,5 +338,5 @@ CLASSES = {
     ),
 }
 
-# Motions that do not reveal all six degrees of freedom: the answer must say so.
+# Classes whose motion does not determine all six degrees of freedom: results must be refused.
 REFUSED = ("flat_agv",)

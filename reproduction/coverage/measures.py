@@ -1,4 +1,4 @@
-"""What the study measures, as rows that can be pooled and printed."""
+"""Measures of the coverage study, as rows that can be pooled and printed."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -11,31 +11,31 @@ from hand_eye_calib.core.base.arrays import FloatArray
 MEDIAN_6 = 5.348
 MEDIAN_3 = 2.366
 
-# Intervals that are meant to cover so much.
+# Nominal coverage of the intervals.
 COVERAGE = 0.90
 
-# Names of the rows that hold all cases of a table.
+# Half-width of a 90 % interval of a normal error, in standard deviations.
+HALF_WIDTH_90 = 1.645
+
+# Names of the pooled rows, which contain all cases of a table.
 POOLED = {
     "simulated": "all classes",
     "known answer": "all known answers",
     "rig": "all rigs",
     "parts": "all parts",
-    "refused": "all that leave something open",
+    "refused": "all with an undetermined axis",
 }
 
-# Of the cases, a list of arrays, one per group: recordings of a class, axes of a set.
+# Statistic of values in groups: an array for each group, such as the recordings of a class.
 _Statistic = Callable[[list[FloatArray]], float]
 
 
 def _root_of_median(median: float) -> _Statistic:
-    """Geometric mean over the groups of the root of the median over what is expected."""
+    """Return a statistic: the geometric mean over the groups of sqrt(median / expected median)."""
 
     def statistic(groups: list[FloatArray]) -> float:
-        return float(
-            np.exp(
-                np.mean([0.5 * np.log(np.median(g) / median) for g in groups])
-            )
-        )
+        logs = [0.5 * np.log(np.median(group) / median) for group in groups]
+        return float(np.exp(np.mean(logs)))
 
     return statistic
 
@@ -48,7 +48,7 @@ def _mean(groups: list[FloatArray]) -> float:
     return float(np.mean(np.concatenate(groups)))
 
 
-# Kinds of measures: title and statistic.
+# Title and statistic of each kind of measure.
 KINDS: dict[str, tuple[str, _Statistic]] = {
     "bound": ("error / bound", _root_of_median(MEDIAN_6)),
     "bound_t": ("translation", _root_of_median(MEDIAN_3)),
@@ -76,11 +76,11 @@ class Row:
     table: str
     name: str
     method: str
-    # Kind of measure to its cases: key ``group/case`` to value.
+    # Values by kind of measure, then by key ``group/case``.
     cases: Mapping[str, Mapping[str, float]]
 
     def value(self, kind: str) -> float:
-        """A measure; NaN if it was not taken."""
+        """Return the statistic of a kind of measure; NaN without values."""
         cases = self.cases.get(kind)
         if not cases:
             return float("nan")
@@ -89,7 +89,7 @@ class Row:
 
 
 def pooled(table: str, name: str, method: str, rows: Iterable[Row]) -> Row:
-    """All cases of the rows of a table as one row."""
+    """Combine the cases of all rows of a table and a method into one row."""
     cases: dict[str, dict[str, float]] = {}
     for row in rows:
         if (row.table, row.method) != (table, method):
@@ -102,7 +102,7 @@ def pooled(table: str, name: str, method: str, rows: Iterable[Row]) -> Row:
 
 
 def _groups(cases: Mapping[str, float]) -> list[FloatArray]:
-    """Values by what their keys have before the last slash."""
+    """Group values by the part of their keys before the last slash."""
     groups: dict[str, list[float]] = {}
     for key, value in cases.items():
         group, _, _ = key.rpartition("/")

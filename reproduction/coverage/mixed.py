@@ -1,6 +1,4 @@
-"""Recordings whose noise is drawn at random, every one another mixture: what the fixed classes did
-not think of.
-"""
+"""Simulated recordings whose noise is a random mixture, beyond the fixed classes."""
 
 from dataclasses import replace
 
@@ -16,7 +14,7 @@ from reproduction.coverage.sensor_errors import (
     sigmas,
 )
 
-# Motion, lever arm (m) and size of its errors; whether odometry drifts by the metre.
+# Motion, lever arm (m), factor of the errors, and whether the drift grows with the distance.
 _KINDS = {
     "mixed_hand": (motions.hand_held, 0.3, 1.0, False),
     "mixed_car": (motions.car, 1.2, 4.0, True),
@@ -36,20 +34,20 @@ _MOST_POSES = 2500
 
 
 def make(name: str, *seeds: int) -> Simulated:
-    """The recording of a motion by these seeds."""
+    """Simulate the recording of a platform with these seeds."""
     key = (*seeds, MIXED.index(name))
     kind = drawn_class(name, np.random.default_rng(key))
     return simulate(kind, key)
 
 
 def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
-    """A class with rate, duration, lever arm and noise drawn."""
+    """Draw a class of recordings: rate, duration, lever arm and noise."""
     motion, lever_m, size, by_metre = _KINDS[name]
     rate_hz = float(rng.choice(_RATES_HZ))
     duration_s = min(_between(rng, 40.0, 300.0), _MOST_POSES / rate_hz)
     parent, child = (_drawn_errors(rng, size, by_metre) for _ in range(2))
     if not (child.walk.any() or child.walk_by_metre.any()):
-        # Jumps and a drifting scale are terms of an odometry that drifts.
+        # Jumps and a drifting scale only make sense for an odometry that drifts.
         child = replace(child, walk=sigmas(0.0003 * size, 0.003))
     return RecordingClass(
         motion=motion,
@@ -64,6 +62,7 @@ def drawn_class(name: str, rng: np.random.Generator) -> RecordingClass:
 def _drawn_errors(
     rng: np.random.Generator, size: float, by_metre: bool
 ) -> SensorErrors:
+    """Draw the errors of a sensor; each kind of error is present with its own probability."""
     rotation_factor = 0.3 if by_metre else 1.0
     metres = _between(rng, 0.0005, 0.006) * size * _by_axis(rng)
     degrees = _between(rng, 0.02, 0.25) * rotation_factor * _by_axis(rng)
@@ -121,10 +120,10 @@ def _slow(
 
 
 def _between(rng: np.random.Generator, low: float, high: float) -> float:
-    """A log-uniform draw."""
+    """Draw a number from a log-uniform distribution."""
     return float(low * (high / low) ** rng.random())
 
 
 def _by_axis(rng: np.random.Generator) -> FloatArray:
-    """Factors (3,) about 1."""
+    """Draw factors (3,) near 1, one for each axis."""
     return np.exp(0.35 * rng.standard_normal(3))

@@ -37,7 +37,7 @@ class Motion:
         return se3.log(steps) / (2.0 * step_s)
 
 
-# A vehicle that follows the advice of the node drives over a ramp at this interval (s).
+# Interval of the ramps (s) of a vehicle that follows the advice of the node.
 RAMP_PERIOD_S = 31.0
 
 
@@ -54,7 +54,10 @@ def _waves(
     band_hz: tuple[float, float],
     waves: int = 6,
 ) -> FloatArray:
-    """Sums of sines (N, columns) of standard deviation 1, frequencies log-uniform in a band."""
+    """Draw sums of sines (N, columns) with standard deviation 1.
+
+    The frequencies are log-uniform in a band.
+    """
     lowest_hz, highest_hz = band_hz
     shape = (waves, columns)
     frequencies = lowest_hz * (highest_hz / lowest_hz) ** rng.random(shape)
@@ -73,7 +76,7 @@ def _wave(
     band_hz: tuple[float, float],
     waves: int = 6,
 ) -> FloatArray:
-    """Sum of sines (N,) as of :func:`_waves`."""
+    """Draw a sum of sines (N,), as in :func:`_waves`."""
     return _waves(rng, times, 1, band_hz, waves)[:, 0]
 
 
@@ -84,7 +87,7 @@ def _smooth_steps(
     levels: Callable[[int], FloatArray],
     smooth_s: float,
 ) -> FloatArray:
-    """A level (N,) drawn anew every hold_s or so, smoothed."""
+    """Return values (N,) that are drawn anew after about ``hold_s``, and smoothed."""
     n_levels = int(np.ptp(times) / hold_s * 2) + 4
     holds_s = rng.uniform(0.5, 1.5, n_levels) * hold_s
     ends = np.cumsum(holds_s)

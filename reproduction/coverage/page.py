@@ -1,4 +1,4 @@
-"""The study as a page: goals and tables."""
+"""Page of the coverage study: goals and tables."""
 
 import re
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from reproduction.coverage.measures import KINDS, POOLED, Row
 from reproduction.published import LEVELS, SIMULATED, path_to
 from reproduction.writing import markdown_table
 
-# Of the other tables the goals say all.
+# Columns of the printed tables. Other tables appear in the goals only.
 _COLUMNS = {
     "simulated": ("bound", "bound_t", "bound_r", "nees", "covers"),
     "levels": ("mm", "deg", "covers"),
@@ -41,15 +41,16 @@ _ABOUT = {
         "adds the uncertainty of the truth to the stated uncertainty."
     ),
 }
+# Kinds of measures that are shares.
 _PERCENT = ("covers", "covers_floor", "covers_truth", "refused")
-# Of the levels of noise, outliers and drift the strongest are shown.
+# Names of the strongest levels of noise, outliers and drift, which are printed.
 _LEVELS_SHOWN = {
     " ".join(path_to(dataset, LEVELS[dataset][-1])) for dataset in SIMULATED
 }
 
 
 class Goal(NamedTuple):
-    """What is aimed at: the range of a measure, in the rows of a table whose names match."""
+    """Aimed range of a kind of measure, in rows of a table whose names match ``names``."""
 
     text: str
     table: str
@@ -59,6 +60,7 @@ class Goal(NamedTuple):
     names: str = "all "
 
 
+# Regular expression for rows that are not pooled.
 _EACH = "(?!all )"
 GOALS = (
     Goal(
@@ -74,19 +76,37 @@ GOALS = (
         "90 % intervals cover 0.88 to 0.92", "simulated", "covers", 0.88, 0.92
     ),
     Goal(
-        "0.82 to 0.97 in every class", "simulated", "covers", 0.82, 0.97, _EACH
+        "90 % intervals of every class cover 0.82 to 0.97",
+        "simulated",
+        "covers",
+        0.82,
+        0.97,
+        _EACH,
     ),
     Goal("flat_agv is refused", "simulated", "refused", 1.0, 1.0, "flat_agv"),
     Goal(
-        "real, with the floor: 0.87 to 0.93",
+        "90 % intervals of real recordings, with the floor, cover 0.87 to 0.93",
         "known answer",
         "covers_floor",
         0.87,
         0.93,
     ),
-    Goal("without it at least 0.80", "known answer", "covers", 0.8, 1.0),
+    Goal(
+        "the same without the floor: at least 0.80",
+        "known answer",
+        "covers",
+        0.8,
+        1.0,
+    ),
     Goal("scatter of rigs over sigma 0.8 to 1.25", "rig", "scatter", 0.8, 1.25),
-    Goal("of each rig 0.6 to 1.5", "rig", "scatter", 0.6, 1.5, _EACH),
+    Goal(
+        "scatter of every rig over sigma 0.6 to 1.5",
+        "rig",
+        "scatter",
+        0.6,
+        1.5,
+        _EACH,
+    ),
     Goal(
         "scatter of halves and thirds over sigma 0.8 to 1.25",
         "parts",
@@ -94,18 +114,40 @@ GOALS = (
         0.8,
         1.25,
     ),
-    Goal("three devices close to 0.10 deg", "cycle", "deg", 0, 0.1, "tango"),
-    Goal("chi2 of that is below 12.6", "cycle", "chi2", 0, 12.6, "tango"),
     Goal(
-        "what leaves something open is refused", "refused", "refused", 1.0, 1.0
+        "misclosure of three devices at most 0.10 deg",
+        "cycle",
+        "deg",
+        0,
+        0.1,
+        "tango",
+    ),
+    Goal(
+        "chi2 of this misclosure below 12.6", "cycle", "chi2", 0, 12.6, "tango"
+    ),
+    Goal(
+        "recordings with an undetermined axis are refused",
+        "refused",
+        "refused",
+        1.0,
+        1.0,
     ),
 )
 
 
 def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
-    """The page in Markdown, from rows, folders of recordings that were not there, and the seeds of
-    the recordings per class. Tables of errors over the truth have a row for each recording, others
-    the pooled rows; ``--rows`` writes all.
+    """Return the page in Markdown.
+
+    The table of known answers has a row for each recording, the table of levels a row for each
+    printed level, and the table of simulated recordings only the pooled row. ``--rows`` writes all.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+    absent : sequence of str
+        Sets of real recordings without a folder.
+    seeds : range
+        Seeds of the recordings of each class.
     """
     methods = list(dict.fromkeys(row.method for row in rows))
     blocks = [
@@ -135,52 +177,66 @@ def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
                 _ABOUT[table],
                 markdown_table(shown),
             ]
-    about = f"{len(seeds)} of each class, from seed {seeds.start} on. All rows: `--rows FILE`."
+    about = (
+        f"{len(seeds)} recordings of each class, from seed {seeds.start} on. "
+        "`--rows FILE` writes all rows."
+    )
     return "\n\n".join(filter(None, [*blocks, about])) + "\n"
 
 
-def _is_shown(row: Row, first: str) -> bool:
+def _is_shown(row: Row, first_method: str) -> bool:
+    """Whether the page contains a row that is not pooled: only rows of the first method."""
     is_shown = row.table == "known answer" or row.name in _LEVELS_SHOWN
-    return row.method == first and is_shown
+    return row.method == first_method and is_shown
 
 
 def reached(goal: Goal, rows: Sequence[Row], method: str) -> str:
-    """The value that is farthest from its range, bold outside of it; empty without any."""
-    values = {
-        row.name: row.value(goal.kind)
-        for row in rows
-        if (row.table, row.method) == (goal.table, method)
-        and re.match(goal.names, row.name)
-    }
-    values = {
-        name: value for name, value in values.items() if np.isfinite(value)
-    }
+    """Return the worst value for a goal as text; empty without a value.
+
+    The worst value is farthest outside of the goal's range, or nearest to its limits. A value
+    outside of the range is bold.
+    """
+    values: dict[str, float] = {}
+    for row in rows:
+        is_of_table = (row.table, row.method) == (goal.table, method)
+        if is_of_table and re.match(goal.names, row.name):
+            value = row.value(goal.kind)
+            if np.isfinite(value):
+                values[row.name] = value
     if not values:
         return ""
-    name = max(
-        values,
-        key=lambda name: max(goal.low - values[name], values[name] - goal.high),
-    )
-    text = f"{values[name]:.3g}" + (f" ({name})" if len(values) > 1 else "")
+
+    def excess(name: str) -> float:
+        return max(goal.low - values[name], values[name] - goal.high)
+
+    name = max(values, key=excess)
+    text = f"{values[name]:.3g}"
+    if len(values) > 1:
+        text = f"{text} ({name})"
     return text if goal.low <= values[name] <= goal.high else f"**{text}**"
 
 
-def _shown(row: Row, columns: Sequence[str], first: str) -> dict[str, str]:
-    name = row.name if row.method == first else f"{row.name}, {row.method}"
-    return {"": name, **{KINDS[kind][0]: cell(row, kind) for kind in columns}}
+def _shown(
+    row: Row, columns: Sequence[str], first_method: str
+) -> dict[str, str]:
+    """Return the cells of a row by title."""
+    name = row.name
+    if row.method != first_method:
+        name = f"{row.name}, {row.method}"
+    cells = {"": name}
+    for kind in columns:
+        title, _ = KINDS[kind]
+        cells[title] = cell(row, kind)
+    return cells
 
 
 def cell(row: Row, kind: str) -> str:
-    """A measure as text; empty if it was not taken."""
+    """Return a measure as text; empty without a value."""
     value = row.value(kind)
     if np.isnan(value):
         return ""
     if kind in _PERCENT:
         return f"{100.0 * value:.0f} %"
-    return (
-        f"{value:.3f}"
-        if kind == "deg"
-        else f"{value:.2f}"
-        if value < 100
-        else f"{value:.0f}"
-    )
+    if kind == "deg":
+        return f"{value:.3f}"
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""Answers of the calibration, held against what is known."""
+"""Rows of the coverage study: results of calibrations, compared with true or repeated values."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -38,7 +38,7 @@ METHODS = {
 def answer(
     parent: Trajectory, child: Trajectory, options: Mapping[str, Any]
 ) -> Calibration | None:
-    """A calibration, None if it fails."""
+    """Calibrate; return None if the calibration fails."""
     try:
         return calibrate(parent, child, **options)
     except HandEyeCalibError:
@@ -46,6 +46,7 @@ def answer(
 
 
 def _of_rig(rig: Rig, name: str, method: str) -> Calibration | None:
+    """Calibrate a recording of a rig."""
     recording = rig.recordings[name]
     return answer(
         recording.parent, recording.child, {**rig.options, **METHODS[method]}
@@ -59,7 +60,7 @@ def _name_of(rig: Rig, name: str) -> str:
 def _row(
     table: str, name: str, method: str, cases: Mapping[str, Mapping[str, float]]
 ) -> Row:
-    """A row from the measures of each case."""
+    """Return a row from the measures of each case."""
     by_kind: dict[str, dict[str, float]] = {}
     for case, measures in cases.items():
         for kind, value in measures.items():
@@ -68,7 +69,7 @@ def _row(
 
 
 def class_row(name: str, method: str, seeds: range) -> Row:
-    """Errors over the bound, NEES and coverage of a simulated class."""
+    """Measure errors over the bound, NEES and coverage of a simulated class."""
     cases = {}
     for seed in seeds:
         recording = classes.make(name, seed)
@@ -97,7 +98,7 @@ def _class_case(
 
 
 def _covers(xi: FloatArray, result: Calibration) -> dict[str, float]:
-    """The share of the components in their intervals, if there are any."""
+    """Return the share of components of xi in their intervals; empty without intervals."""
     covariance = result.covariance_measured
     if not np.isfinite(covariance).all():
         return {}
@@ -109,7 +110,7 @@ def _covers(xi: FloatArray, result: Calibration) -> dict[str, float]:
 def level_row(
     folder: Path, dataset: str, level: float | None, method: str
 ) -> Row:
-    """Errors on the published trajectories of a level."""
+    """Measure errors on the published trajectories of a level."""
     levels = None if level is None else [level]
     cases = {}
     for case in load_simulated(folder, [dataset], levels):
@@ -130,7 +131,7 @@ def _squared(xi: FloatArray, covariance: FloatArray) -> float:
 
 
 def truth_row(rig: Rig, name: str, method: str) -> Row:
-    """Error of a real recording against the known answer, over the axes that both know."""
+    """Measure the error of a real recording against its known extrinsic."""
     assert rig.truth is not None
     result = _of_rig(rig, name, method)
     cases = {}
@@ -142,12 +143,16 @@ def truth_row(rig: Rig, name: str, method: str) -> Row:
 def truth_cases(
     result: Calibration, truth: Truth
 ) -> dict[str, dict[str, float]]:
-    """Error of an answer over the axes that both know, and whether its intervals cover the truth:
-    without the common-mode floor, with it, and with the uncertainty of the truth.
+    """Return the error of a result, and whether its intervals contain the true values.
+
+    Only axes that the truth and the motion determine are compared. ``covers`` is for intervals
+    without the common-mode floor, ``covers_floor`` for those with the floor, and ``covers_truth``
+    for those without the floor but with the uncertainty of the truth.
     """
     is_comparable = np.isfinite(truth.sigmas) & _knows(result)
     error = deviation(result.T_parent_child, truth.T_parent_child)
-    # A rotation whose axis is not known to the truth has no small rotation vector.
+    # If the truth lacks a rotation axis, the whole rotation may differ much, so the angles are
+    # compared one by one.
     if not np.isfinite(truth.sigmas[3:]).all():
         error[3:] = _angle_differences(
             result.T_parent_child, truth.T_parent_child
@@ -177,7 +182,7 @@ def truth_cases(
 
 
 def _angle_differences(T: FloatArray, T_truth: FloatArray) -> FloatArray:
-    """Differences (3,) of roll, pitch and yaw, rad."""
+    """Return the differences (3,) of roll, pitch and yaw, rad."""
     rpy = se3.rotation_to_rpy(T[:3, :3])
     true_rpy = se3.rotation_to_rpy(T_truth[:3, :3])
     differences = rpy - true_rpy
@@ -197,7 +202,7 @@ def _by_axis(values: BoolArray, is_comparable: BoolArray) -> dict[str, float]:
 
 
 def refused_row(rig: Rig, name: str, method: str) -> Row:
-    """Whether a recording that leaves something open is refused: no answer, or not an OK one."""
+    """Measure whether a recording with an undetermined axis is refused: no result, or not OK."""
     result = _of_rig(rig, name, method)
     is_refused = result is None or result.status is not SolveStatus.OK
     cases = {"refused": {"": float(is_refused)}}
@@ -205,13 +210,13 @@ def refused_row(rig: Rig, name: str, method: str) -> Row:
 
 
 def scatter_row(rig: Rig, method: str) -> Row:
-    """Scatter between the recordings of a rig over their stated sigmas."""
+    """Measure the scatter between the recordings of a rig, over their stated sigmas."""
     answers = [_of_rig(rig, name, method) for name in rig.recordings]
     return Row("rig", rig.name, method, {"scatter": _scatter_cases(answers)})
 
 
 def parts_row(rig: Rig, name: str, method: str) -> Row:
-    """Scatter between halves and between thirds of a recording over their stated sigmas."""
+    """Measure the scatter of halves and of thirds of a recording, over their stated sigmas."""
     whole = _of_rig(rig, name, method)
     cases: dict[str, float] = {}
     if whole is None:
@@ -256,7 +261,7 @@ def _scatter_cases(answers: Sequence[Calibration | None]) -> dict[str, float]:
 
 
 def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
-    """How far three pairwise answers miss closing, and that over their stated covariances."""
+    """Measure the misclosure of three pairwise extrinsics, and its chi-square."""
     results = [_of_rig(rigs[name], "whole", method) for name in CYCLE]
     good = [result for result in results if result is not None]
     if len(good) < len(results):
@@ -273,9 +278,11 @@ def cycle_row(rigs: Mapping[str, Rig], method: str) -> Row:
 
 
 def misclosure(answers: list[Calibration]) -> tuple[FloatArray, FloatArray]:
-    """Error (6,) of a closed chain of answers, first parent to last child, with its covariance
-    (6, 6), both in the frame of the last child. The lengths of each answer are multiplied by the
-    scales of the answers before it: all lengths are in the unit of the first parent.
+    """Return the error (6,) of a closed chain of extrinsics, and its covariance (6, 6).
+
+    The chain leads from the first parent to the last child, which are the same sensor. Error and
+    covariance are in the frame of the last child. The lengths of each extrinsic are multiplied by
+    the scales of the extrinsics before, so that all lengths are in the unit of the first parent.
     """
     closed = np.eye(4)
     covariance = np.zeros((6, 6))

@@ -1,4 +1,4 @@
-"""Errors of a sensor's poses: what kinds there are, and draws of them.
+"""Kinds of errors of a sensor's poses, and random draws of these errors.
 
 Errors act on the right, in the sensor's own frame: ``T_measured = T_true Exp(error)``. A sensor has
 white errors, Gauss-Markov errors fixed to its body or to its world, and errors of its increments
@@ -16,7 +16,7 @@ from hand_eye_calib.core.geometry import se3
 def sigmas(
     metres: float | FloatArray, degrees: float | FloatArray
 ) -> FloatArray:
-    """Standard deviations (6,) of (rho, phi), in m and rad."""
+    """Return standard deviations (6,) of (rho, phi), in m and rad."""
     translation = np.full(3, 1.0) * metres
     rotation = np.radians(np.full(3, 1.0) * degrees)
     return np.concatenate([translation, rotation])
@@ -28,7 +28,10 @@ def _no_error() -> FloatArray:
 
 @dataclass(frozen=True)
 class GaussMarkov:
-    """A stationary first-order process: correlation time tau_s, standard deviations (6,)."""
+    """A stationary first-order process: correlation time (s) and standard deviations (6,).
+
+    Its axes are those of the sensor, or of the sensor's world if ``in_world`` is set.
+    """
 
     tau_s: float
     sigma: FloatArray
@@ -59,8 +62,10 @@ class Tail:
         return np.where(is_worse, self.factor, 1.0)
 
     def information(self) -> float:
-        """Fisher information of the location of a 6-dimensional error, over that of the Gaussian
-        core. Bursts last long enough to be seen: there each pose's factor counts as known.
+        """Return the Fisher information of the location of a 6-dimensional error.
+
+        The unit is the information of the Gaussian core. Bursts are long enough to be recognised,
+        so the factor of each of their poses counts as known.
         """
         if self.kind == "student":
             return (self.factor + 6.0) / (self.factor + 8.0)
@@ -72,7 +77,7 @@ class Tail:
 def _bursts(
     rng: np.random.Generator, count: int, share: float, length: float
 ) -> BoolArray:
-    """Whether each pose (N,) lies in a burst; bursts last ``length`` poses on average."""
+    """Return whether each pose (N,) is in a burst; bursts last ``length`` poses on average."""
     is_inside = False
     flags = np.empty(count, dtype=bool)
     leave = 1.0 / length
@@ -88,8 +93,10 @@ def _bursts(
 def mixture_information(
     share: float, factor: float, dimensions: int = 6
 ) -> float:
-    """Fisher information of the location of (1 - share) N(0, I) + share N(0, factor^2 I), per
-    dimension, by an integral over the radius.
+    """Return the Fisher information per dimension of the location of a Gaussian mixture.
+
+    The mixture is (1 - share) N(0, I) + share N(0, factor^2 I). The information is an integral over
+    the radius.
     """
     radius = np.linspace(1e-6, 8.0 * factor + 8.0, 400_000)
     core = (1.0 - share) * np.exp(-0.5 * radius**2)
@@ -98,10 +105,11 @@ def mixture_information(
     density = core + wide
     slope = radius * (core + wide / factor**2)
 
-    is_seen = density > 1e-300
-    density = density[is_seen]
-    slope = slope[is_seen]
-    surface = radius[is_seen] ** (dimensions - 1)
+    # A density that underflows cannot be a divisor.
+    is_positive = density > 1e-300
+    density = density[is_positive]
+    slope = slope[is_positive]
+    surface = radius[is_positive] ** (dimensions - 1)
     total = np.sum(surface * density)
     information = np.sum(surface * slope**2 / density)
     return float(information / total / dimensions)
@@ -109,7 +117,7 @@ def mixture_information(
 
 @dataclass(frozen=True, kw_only=True)
 class SensorErrors:
-    """What a sensor gets wrong."""
+    """Sizes of all errors of a sensor."""
 
     # Standard deviations of each pose; (6,) array.
     white: FloatArray
@@ -119,9 +127,9 @@ class SensorErrors:
     slow: tuple[GaussMarkov, ...] = ()
     # Standard deviation and correlation time (s) of a drifting scale.
     scale: tuple[float, float] | None = None
-    # Standard deviation of the stamps.
+    # Standard deviation of the stamps (s).
     jitter_s: float = 0.0
-    # Of the white errors.
+    # Outliers of the white errors, which are Gaussian without.
     tail: Tail | None = None
     jumps_per_s: float = 0.0
     # Standard deviations of a jump; (6,) array.
@@ -130,9 +138,9 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class DrawnErrors:
-    """A sensor's poses with one draw of its errors, and what the bound takes as known."""
+    """Measured poses of a sensor with drawn errors, and covariances for the Cramer-Rao bound."""
 
-    # As measured; (N, 4, 4) array.
+    # Measured poses; (N, 4, 4) array.
     poses: FloatArray
     # Inverse Fisher information of the white errors: their covariance if they are Gaussian; (N, 6,
     # 6) array.
@@ -185,7 +193,7 @@ def _white(
     tail_rng: np.random.Generator,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray]:
-    """White errors (N, 6) and their inverse Fisher information (N, 6, 6)."""
+    """Draw white errors (N, 6); return them and their inverse Fisher information (N, 6, 6)."""
     count = len(twists)
     factors = np.ones(count)
     variance_factors = np.ones(count)
@@ -208,7 +216,7 @@ def _white(
 def _walk_variances(
     errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Variances (N-1, 6) of the increments' white errors."""
+    """Return the variances (N-1, 6) of the increments' white errors; draw the instants of jumps."""
     lengths_m = np.linalg.norm(steps[:, :3, 3], axis=1)
     is_jump = rng.random(len(steps)) < errors.jumps_per_s * dt
     by_time = errors.walk**2 * dt
@@ -220,7 +228,7 @@ def _walk_variances(
 def _scale_errors(
     errors: SensorErrors, steps: FloatArray, dt: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Errors (N-1, 6) of the increments that a drifting scale makes."""
+    """Draw the errors (N-1, 6) of the increments from a drifting scale."""
     n_steps = len(steps)
     if errors.scale is None:
         return np.zeros((n_steps, 6))
@@ -231,7 +239,7 @@ def _scale_errors(
 
 
 def scale_columns(steps: FloatArray) -> FloatArray:
-    """Errors (N-1, 6) of increments (N-1, 4, 4) per unit of relative scale."""
+    """Return the errors (N-1, 6) of increments (N-1, 4, 4) per unit of relative scale."""
     rotations = steps[:, :3, :3]
     translations = steps[:, :3, 3]
     rho = np.einsum("nji,nj->ni", rotations, translations)
@@ -249,7 +257,7 @@ def _integrated(start: FloatArray, steps: FloatArray) -> FloatArray:
 def _markov(
     count: int, columns: int, phi: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Stationary first-order processes (N, columns) of variance 1."""
+    """Draw stationary first-order processes (N, columns) of variance 1."""
     values = rng.standard_normal((count, columns))
     innovation_sigma = np.sqrt(1.0 - phi**2)
     values[1:] *= innovation_sigma
@@ -269,7 +277,7 @@ def _slow(
 
 
 def directions(process: GaussMarkov, Ts: FloatArray) -> FloatArray:
-    """Matrices (N, 6, 6) from a process to errors in the sensor's frame."""
+    """Return matrices (N, 6, 6) that map a process to errors in the sensor's frame."""
     matrices = np.tile(np.eye(6), (len(Ts), 1, 1))
     if process.in_world:
         to_body = np.swapaxes(Ts[:, :3, :3], 1, 2)

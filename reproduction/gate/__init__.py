@@ -1,1 +1,1 @@
-"""What a change of the package does to errors and stated uncertainties."""
+"""Gate for changes of the package: errors and stated uncertainties must not become worse."""

@@ -1,11 +1,12 @@
 """``python -m reproduction.gate``: did a change make errors or stated uncertainties worse?
 
-Simulated recordings of every class of the coverage study and of random platforms are calibrated,
-and with --data-folder real ones with a known answer, whole and in pieces. The same recordings have
-scores in a stored baseline. Exit code 1 if figures are worse than there by more than a tolerance.
+The gate calibrates simulated recordings of every class of the coverage study and of random
+platforms. With --data-folder, it also calibrates real recordings with a known extrinsic, whole and
+in pieces. A stored baseline contains scores of the same recordings. The exit code is 1 if new
+scores are worse than the baseline by more than a tolerance.
 
---against FOLDER compares with another version of the package (a folder that holds
-``hand_eye_calib``) instead, on recordings drawn anew.
+--against FOLDER compares with another version of the package instead, on new recordings. FOLDER
+contains ``hand_eye_calib``.
 """
 
 import os
@@ -45,7 +46,7 @@ _PIECES = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the gate; returns the exit code."""
+    """Run the gate, and return the exit code."""
     parser = study_parser("reproduction.gate", __doc__)
     add = parser.add_argument
     add(
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--pieces",
         type=int,
         default=_PIECES,
-        help="with --against: of each real recording",
+        help="with --against: pieces of each real recording",
     )
     add(
         "--repeats",
@@ -110,7 +111,7 @@ def _run(arguments: Namespace) -> int:
 
 
 def _check(arguments: Namespace) -> int:
-    """Compare with the baseline; 1 if something is worse."""
+    """Compare with the baseline; return 1 if a value is worse."""
     baseline = Baseline.read(arguments.baseline)
     numbers = QUICK if arguments.quick else USUAL
     folder = None if arguments.quick else arguments.data_folder
@@ -156,7 +157,7 @@ def _report(comparisons: Sequence[Comparison], baseline: Baseline) -> str:
 
 
 def _update(arguments: Namespace) -> int:
-    """Store scores. Those of recordings that are not solved here stay, if the seed stays."""
+    """Store scores. Scores of recordings that are not solved here are kept if the seed is kept."""
     stored: dict[str, Score] = {}
     seed = arguments.seed
     if arguments.baseline.exists():
@@ -170,7 +171,7 @@ def _update(arguments: Namespace) -> int:
     kept = len(stored.keys() - measured.keys())
     if kept:
         note(
-            f"{kept} scores of recordings that are not in reach stay as they were"
+            f"{kept} scores are kept: their recordings are not on this computer"
         )
     Baseline(seed, versions(), stored | measured).write(arguments.baseline)
     print(f"{len(measured)} scores in {arguments.baseline}")
@@ -194,7 +195,7 @@ def measure(
 
 
 def _against(arguments: Namespace) -> int:
-    """Compare with another version, without judgement."""
+    """Compare with another version; differences do not change the exit code."""
     seed = seed_of(arguments.seed)
     cases = [*simulated_cases(seed, arguments.repeats)]
     if arguments.data_folder:
@@ -213,7 +214,7 @@ def _against(arguments: Namespace) -> int:
 
 
 def versions() -> str:
-    """Versions of what the last bits of results depend on."""
+    """Return the versions of Python, NumPy and SciPy, which change the last bits of results."""
     names = [f"{name} {version(name)}" for name in ("numpy", "scipy")]
     return ", ".join([f"python {sys.version.split()[0]}", *names])
 

@@ -1,7 +1,8 @@
-"""Answers of this version and of another one on the same recordings.
+"""Comparison of this version with another version of the package, on the same recordings.
 
-Errors over those of the other version, over the Cramer-Rao bound where there is one, NEES, and how
-often stated 90 % intervals hold the truth, with the common-mode floor and without.
+The table contains the ratio of the errors to those of the other version, the ratio to the
+Cramer-Rao bound of simulated recordings, NEES, and the coverage of the 90 % intervals with and
+without the common-mode floor.
 """
 
 import os
@@ -16,45 +17,44 @@ import numpy as np
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation
-from reproduction.coverage.measures import MEDIAN_6
+from reproduction.coverage.measures import HALF_WIDTH_90, MEDIAN_6
 from reproduction.gate.cases import Case
 from reproduction.writing import markdown_table
 
-# Runs with any version since 0.1: the answer, and its covariance without and with the allowance. In
-# earlier versions covariance was without it.
+# Script that runs with all versions since 0.1. It stores the extrinsic, its covariances without and
+# with the allowance, and the determined axes. In old versions, ``covariance`` is without allowance.
 _SOLVE = """
 import pickle, sys, warnings
 import numpy as np
 import hand_eye_calib as hec
 warnings.simplefilter("ignore")
-found = []
+answers = []
 for streams, options in pickle.load(open(sys.argv[1], "rb")):
     try:
-        result = hec.calibrate(*(hec.Trajectory(*each) for each in streams), **options)
+        parent, child = [hec.Trajectory(*stream) for stream in streams]
+        result = hec.calibrate(parent, child, **options)
         known = np.isfinite([dof.sigma for dof in result.observability])
         measured = getattr(result, "covariance_measured", result.covariance)
         whole = getattr(result, "covariance_with_floor", result.covariance)
-        found.append((result.T_parent_child, measured, whole, known))
+        answers.append((result.T_parent_child, measured, whole, known))
     except Exception:
-        found.append(None)
-pickle.dump(found, open(sys.argv[2], "wb"))
+        answers.append(None)
+pickle.dump(answers, open(sys.argv[2], "wb"))
 """
-
-_90_PERCENT = 1.645
 
 
 def solved(
     cases: list[Case], package: Path, options: dict[str, Any]
 ) -> list[Any]:
-    """Answers of the version of the package in a folder."""
-    asked = []
+    """Return the answers of the version of the package in the folder ``package``."""
+    tasks = []
     for case in cases:
         streams = [(stream.stamps_ns, stream.poses) for stream in case.streams]
-        asked.append((streams, case.options | options))
+        tasks.append((streams, case.options | options))
     with tempfile.TemporaryDirectory() as folder:
-        cases_file = Path(folder) / "given"
-        answers_file = Path(folder) / "found"
-        cases_file.write_bytes(pickle.dumps(asked))
+        cases_file = Path(folder) / "cases"
+        answers_file = Path(folder) / "answers"
+        cases_file.write_bytes(pickle.dumps(tasks))
         environment = os.environ | {"PYTHONPATH": str(package)}
         command = [
             sys.executable,
@@ -68,7 +68,10 @@ def solved(
 
 
 def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
-    """Errors of translation and rotation; half of what the truth is not known to counts."""
+    """Return the errors of translation (m) and rotation (rad); NaN without a known axis.
+
+    Half of the truth's standard deviation is added in quadrature.
+    """
     is_determined = is_determined & np.isfinite(case.sigmas)
     errors = deviation(answer[0], case.T_parent_child)
     squares = errors**2 + 0.25 * case.sigmas**2
@@ -83,7 +86,7 @@ def _sizes(case: Case, answer: Any, is_determined: BoolArray) -> FloatArray:
 def _error_ratios(
     cases: list[Case], own_answers: list[Any], answers: list[Any]
 ) -> FloatArray:
-    """Geometric means of our errors of translation and rotation over those of other answers."""
+    """Return geometric means of the ratios of own errors to other errors: translation, rotation."""
     logs = []
     for case, own, other in zip(cases, own_answers, answers, strict=True):
         if own is None or other is None:
@@ -100,7 +103,7 @@ def _per_cent(flags: list[bool]) -> str:
 def row(
     cases: list[Case], own_answers: list[Any], others: dict[str, list[Any]]
 ) -> dict[str, str]:
-    """Figures of the recordings of one family."""
+    """Return the cells of the recordings of one family."""
     cells = {"recordings": str(len(cases))}
     for name, answers in others.items():
         ratios = _error_ratios(cases, own_answers, answers)
@@ -124,7 +127,7 @@ def row(
             variances = (
                 np.diag(to_parent @ covariance @ to_parent.T) + case.sigmas**2
             )
-            is_covered = np.abs(errors) < _90_PERCENT * np.sqrt(variances)
+            is_covered = np.abs(errors) < HALF_WIDTH_90 * np.sqrt(variances)
             flags += [*is_covered[is_comparable]]
         if case.bound is not None and is_known.all():
             xi = to_parent.T @ errors
@@ -144,7 +147,7 @@ def _chosen(values: list[Any], rows: list[int]) -> list[Any]:
 
 
 def table(cases: list[Case], package: Path, against: Path) -> str:
-    """A row for every family, and one for all."""
+    """Return a table with a row for each family and a row for all recordings."""
     own_answers = solved(cases, package, {})
     others = {
         "its default": solved(cases, against, {}),
@@ -153,17 +156,20 @@ def table(cases: list[Case], package: Path, against: Path) -> str:
     rows = []
     families = [*dict.fromkeys(case.family for case in cases)]
     for family in (*families, "all"):
-        which = [
-            i for i, case in enumerate(cases) if family in ("all", case.family)
+        members = [
+            index
+            for index, case in enumerate(cases)
+            if family in ("all", case.family)
         ]
-
         others_of_family = {
-            name: _chosen(answers, which) for name, answers in others.items()
+            name: _chosen(answers, members) for name, answers in others.items()
         }
-        figures = row(
-            _chosen(cases, which), _chosen(own_answers, which), others_of_family
+        cells = row(
+            _chosen(cases, members),
+            _chosen(own_answers, members),
+            others_of_family,
         )
-        rows.append({"family": family} | figures)
+        rows.append({"family": family} | cells)
 
     columns: dict[str, str] = {}
     for cells in rows:

@@ -1,4 +1,4 @@
-"""Scores of one version against stored ones: what counts as a regression."""
+"""Comparison of scores with a stored baseline: limits of a regression."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -14,17 +14,18 @@ from reproduction.coverage.measures import COVERAGE, MEDIAN_6
 from reproduction.gate.scores import Score
 from reproduction.writing import TableRow
 
-# Verdicts from the least strict to the strictest; the last: no answer.
+# Verdicts from the least strict to the strictest; the last entry means no answer.
 _VERDICTS = ("USE", "USE WITH CARE", "DO NOT USE", "")
 
-# Families with fewer recordings are shown, and judged with all others only.
+# A family with fewer recordings has a row, but no limits of its own.
 _FEWEST_RECORDINGS = 8
 
-# Added in quadrature to errors before they are compared, as a share of the family's median error:
-# an error that is zero by luck is no achievement.
+# This share of the family's median error is added in quadrature to errors before they are compared,
+# so that errors near zero by chance do not dominate the ratios.
 _LUCK = 0.5
 
-# Standard errors: figures of recordings drawn anew are beyond by chance once in 4,000 runs.
+# Largest difference of new recordings from the baseline, in standard errors. Chance exceeds it once
+# in 4,000 runs.
 _CHANCE = 3.5
 
 
@@ -32,18 +33,18 @@ _CHANCE = 3.5
 class Tolerances:
     """Limits of a regression.
 
-    Solves repeat to the last bits on one machine. Other versions of NumPy, SciPy or their BLAS
-    change decisions of the estimator in a few of a hundred recordings.
+    Results on one machine are reproducible to the last bit. Other versions of NumPy, SciPy or their
+    BLAS change decisions of the estimator in a few per cent of the recordings.
     """
 
-    # Geometric mean of the errors over those of the baseline.
+    # Largest geometric mean of the errors over those of the baseline.
     error_ratio: float
-    # How much farther than in the baseline the share of true values in measured 90 % intervals may
-    # be from 90 %, and how much the share in intervals with the allowance may fall.
+    # Coverage of the measured 90 % intervals may be farther from 90 % than in the baseline by this
+    # share. Coverage of the intervals with the allowance may decrease by the same share.
     coverage: float
-    # Factor by which the median squared error under the measured covariance may change.
+    # Factor by which the median NEES of the measured covariance may change.
     nees: float
-    # Share of recordings whose verdict may be stricter.
+    # Share of recordings whose verdict may become stricter.
     stricter: float
 
 
@@ -55,7 +56,7 @@ _OF_FAMILY = Tolerances(
 
 @dataclass(frozen=True)
 class Baseline:
-    """Stored scores, the seed of their recordings, and the versions that they were made with."""
+    """Stored scores, the seed of their recordings, and the versions of Python, NumPy and SciPy."""
 
     seed: int
     versions: str
@@ -87,7 +88,7 @@ class Baseline:
 
 
 def _values_of(score: Score) -> dict[str, Any]:
-    """Values that differ from those of a recording without an answer, rounded."""
+    """Return the values of a score for the file: rounded, without values that are not set."""
     empty = asdict(Score(family="", name="", verdict=""))
     values = {
         name: value
@@ -118,14 +119,17 @@ def _score_of(values: dict[str, Any]) -> Score:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Figures of some recordings beside those of the baseline; ``failures`` are sentences."""
+    """Row of a table, and sentences about values that are worse than the tolerances."""
 
     row: TableRow
     failures: list[str]
 
 
 def compare(scores: Sequence[Score], baseline: Baseline) -> list[Comparison]:
-    """Compare scores family by family, then all together; the baseline has all of them."""
+    """Compare scores with the baseline, family by family and then all together.
+
+    The baseline must contain all recordings.
+    """
     families = [*dict.fromkeys(score.family for score in scores)]
     comparisons = []
     for family in families:
@@ -145,12 +149,14 @@ def _comparison(
     before: Sequence[Score],
     tolerances: Tolerances | None,
 ) -> Comparison:
+    """Compare the scores of a family with those of the baseline; no limits without tolerances."""
     figures = _figures(now)
     old_figures = _figures(before)
     figures["error / baseline"] = error_ratio(now, before)
-    figures["stricter"] = float(
-        sum(_is_stricter(*pair) for pair in zip(now, before, strict=True))
-    )
+    n_stricter = 0
+    for new, old in zip(now, before, strict=True):
+        n_stricter += _is_stricter(new, old)
+    figures["stricter"] = float(n_stricter)
     row: dict[str, object] = {"family": family, "recordings": len(now)}
     for name, value in figures.items():
         text = _FORMATS[name].format(value)
@@ -182,7 +188,7 @@ _FORMATS = {
 
 
 def _figures(scores: Sequence[Score]) -> dict[str, float]:
-    """Figures of one version; NaN without a recording that has the figure."""
+    """Return the values of the columns; NaN if no recording has a value."""
     over_bound = [
         score.over_bound for score in scores if score.over_bound is not None
     ]
@@ -252,7 +258,7 @@ def _failures(
     tolerances: Tolerances,
     scores: Sequence[Score],
 ) -> Iterator[str]:
-    """Sentences about figures beyond their tolerances. A figure that is NaN is never beyond."""
+    """Yield a sentence for each value outside its tolerance; NaN is never outside."""
     if figures["error / baseline"] > tolerances.error_ratio:
         yield (
             f"errors are {figures['error / baseline']:.3f} times those of the baseline; the limit "
@@ -287,10 +293,10 @@ def _failures(
 def compare_new_draw(
     scores: Sequence[Score], old_scores: Sequence[Score]
 ) -> Comparison:
-    """Compare figures of recordings drawn anew with those of others of the same families.
+    """Compare new recordings with the stored recordings of the same families.
 
-    The seed of the baseline can be tuned on, a new one cannot. Differences count beyond
-    ``_CHANCE`` standard errors.
+    An estimator can be tuned to the recordings of the baseline, but not to new ones. Differences
+    above ``_CHANCE`` standard errors are failures.
     """
     figures = _figures(scores)
     old_figures = _figures(old_scores)
@@ -330,7 +336,7 @@ def _shares_outside(scores: Sequence[Score]) -> FloatArray:
 
 
 def _excess(samples: Sequence[FloatArray]) -> float:
-    """Mean of the first sample less that of the second, in standard errors."""
+    """Return the mean of the first sample minus that of the second, in standard errors."""
     new, old = samples
     error = np.sqrt(new.var(ddof=1) / len(new) + old.var(ddof=1) / len(old))
     return float((new.mean() - old.mean()) / error)

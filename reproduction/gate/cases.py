@@ -18,7 +18,11 @@ _FEWEST_POSES = 100
 
 
 class Case(NamedTuple):
-    """A recording: its truth, how well that is known (6,), and the bound (6, 6) if there is one."""
+    """A recording with its true extrinsic.
+
+    ``sigmas`` (6,) are the standard deviations of the truth (m, rad) along and about the parent's
+    axes. ``bound`` is the Cramer-Rao bound (6, 6) of a simulated recording.
+    """
 
     family: str
     name: str
@@ -27,7 +31,7 @@ class Case(NamedTuple):
     T_parent_child: FloatArray
     sigmas: FloatArray
     bound: FloatArray | None = None
-    # The motion does not determine all axes: the verdict USE is wrong.
+    # Whether the verdict USE is wrong, because the motion does not determine all axes.
     must_not_be_used: bool = False
 
 
@@ -50,7 +54,7 @@ def simulated_case(family: str, seed: int, number: int) -> Case:
 
 
 def simulated_cases(seed: int, repeats: int) -> Iterator[Case]:
-    """Random platforms."""
+    """Yield recordings of random platforms, ``repeats`` of each."""
     for number, family in product(range(repeats), mixed.MIXED):
         yield simulated_case(family, seed, number)
 
@@ -61,7 +65,10 @@ def real_cases(
     rng: np.random.Generator,
     option_names: Container[str] = ("time_offset",),
 ) -> Iterator[Case]:
-    """Recordings with a known answer, with some of their options, and random pieces of each."""
+    """Yield real recordings with a known extrinsic, and random pieces of each.
+
+    Only the options in ``option_names`` are used.
+    """
     rigs, _ = real_rigs(folder)
     for rig in rigs:
         if rig.truth is None or rig.is_refused or rig.name == "boreas":
@@ -89,7 +96,7 @@ def real_cases(
 def _pieces(
     recording: Recording, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[Trajectory, Trajectory]]:
-    """Random pieces of a recording; those with too few poses are left out."""
+    """Yield random pieces of a recording; pieces with too few poses are left out."""
     parent = recording.parent
     child = recording.child
     log_shares = np.log(_SHARES)

@@ -8,12 +8,11 @@ from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 from hand_eye_calib.core.geometry.se3 import deviation, rotation_of
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.reasons import Verdict
-from reproduction.coverage.measures import MEDIAN_3
+from reproduction.coverage.measures import HALF_WIDTH_90, MEDIAN_3
 from reproduction.coverage.scores import answer
 from reproduction.gate.cases import Case, simulated_case
 
-# Half widths of a 90 % and of a 99.9 % interval, in standard deviations.
-_REACH_90 = 1.645
+# Half-width of a 99.9 % interval, in standard deviations.
 _REACH_999 = 3.3
 
 _PARTS = (slice(0, 3), slice(3, 6))
@@ -23,15 +22,15 @@ _UNITS = (1e3, 180.0 / np.pi)
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """Errors and intervals of the answer to one recording.
+    """Errors and intervals of the result of one recording.
 
-    ``errors`` are those of translation and rotation, over the bound if there is one, otherwise in
-    mm and deg; empty if an axis of a simulated recording is missing. ``robust_errors`` are the
-    errors of robust least squares on the same recording, in the same units. ``over_bound`` and
-    ``nees`` are squared Mahalanobis distances of the errors (6 degrees of freedom) for the bound
-    and for the measured covariance.
-    ``inside`` counts true values in measured 90 % intervals, ``inside_allowance`` those in
-    intervals with the allowance, out of ``axes``.
+    ``errors`` are the errors of translation and rotation. They are divided by the bound for
+    simulated recordings, and in mm and deg for real recordings. They are empty if an axis of a
+    simulated recording is unobserved. ``robust_errors`` are the errors of robust least squares on
+    the same recording, in the same units. ``over_bound`` and ``nees`` are squared Mahalanobis
+    distances of the errors (6 degrees of freedom), for the bound and for the measured covariance.
+    ``axes`` is the number of compared axes, ``inside`` counts true values in measured 90 %
+    intervals, and ``inside_allowance`` those in intervals with the allowance.
     """
 
     family: str
@@ -88,8 +87,8 @@ def score(case: Case) -> Score:
         over_bound=over_bound,
         nees=nees,
         axes=int(is_known.sum()),
-        inside=int((sizes < _REACH_90 * measured).sum()),
-        inside_allowance=int((sizes < _REACH_90 * stated).sum()),
+        inside=int((sizes < HALF_WIDTH_90 * measured).sum()),
+        inside_allowance=int((sizes < HALF_WIDTH_90 * stated).sum()),
         is_wrong=is_use and bool((sizes > _REACH_999 * stated).any()),
     )
 

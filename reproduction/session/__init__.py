@@ -1,1 +1,1 @@
-"""The studies of docs/measurements.md: when to stop, whether and what has moved."""
+"""Studies of docs/measurements.md: end of a session, several recordings, mount monitor."""

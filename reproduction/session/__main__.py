@@ -1,7 +1,8 @@
-"""``python -m reproduction.session``: the studies of docs/measurements.md.
+"""``python -m reproduction.session``: studies of docs/measurements.md.
 
-stop: is a session that is told to stop good enough? ramps: the same of vehicles over ramps.
-together: several recordings of one rig, for one result. alarms, delays: of the mount monitor.
+stop: errors at the end of a session. ramps: the same for vehicles that drive over ramps.
+together: one result from several recordings of a rig. alarms: false alarms of the mount monitor.
+delays: time until the mount monitor detects a shift.
 """
 
 import argparse
@@ -13,16 +14,21 @@ from hand_eye_calib.offline.cli.main import exit_code_of
 from reproduction.recordings import Rig, real_rigs
 from reproduction.runner import in_parallel, kept
 from reproduction.session import mount, ramps, stop, together
-from reproduction.writing import show, study_parser
+from reproduction.writing import (
+    add_seed_options,
+    seeds_of,
+    show,
+    study_parser,
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a study; returns the exit code."""
+    """Run a study, and return the exit code."""
     parser = study_parser("reproduction.session", __doc__)
     add = parser.add_argument
     add("study", choices=tuple(STUDIES))
     out = Path("reproduced")
-    about = "where results are kept; they are not solved again"
+    about = "folder of stored results, which are not computed again"
     add(
         "--rows",
         metavar="DIR",
@@ -30,12 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         default=out,
         help=f"{about}. Default: {out}",
     )
-    add(
-        "--seeds", type=int, default=4, help="recordings of a class. Default: 4"
-    )
-    add(
-        "--first-seed", type=int, default=0, help="fresh recordings. Default: 0"
-    )
+    add_seed_options(parser, 4)
     add(
         "--hours",
         type=float,
@@ -47,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the study; returns the exit code."""
+    """Run the study, print its text, and return the exit code."""
     text = STUDIES[arguments.study](arguments)
     show(arguments.page, {f"session {arguments.study}": text})
     return 0
@@ -88,7 +89,7 @@ def _stop(arguments: argparse.Namespace) -> str:
 
 
 def _ramps(arguments: argparse.Namespace) -> str:
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    seeds = seeds_of(arguments)
     rows_of_seeds = in_parallel(
         ramps.ends, [(seed,) for seed in seeds], arguments.jobs
     )
@@ -96,7 +97,7 @@ def _ramps(arguments: argparse.Namespace) -> str:
 
 
 def _together(arguments: argparse.Namespace) -> str:
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    seeds = seeds_of(arguments)
     tasks = {
         f"{name} {seed}": (name, seed)
         for name in together.SIMULATED

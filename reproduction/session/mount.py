@@ -1,7 +1,7 @@
-"""The mount monitor: false alarms and delays until a shift is seen.
+"""Study of the mount monitor: false alarms, and delays until a shift is detected.
 
-Simulated recordings of ten minutes follow each other, with one extrinsic; the motion and the errors
-are drawn anew for each. A shift is put into the child's poses.
+Simulated recordings of ten minutes follow each other. All have the same extrinsic, but new motion
+and new errors. A shift of the mount is a change of the child's poses.
 """
 
 import copy
@@ -18,27 +18,32 @@ from hand_eye_calib.extras.mount.monitor import MountMonitor
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.writing import markdown_table, triple
 
+# Duration of a recording (s).
 PIECE_S = 600.0
-# Not the flat floor, which hides the height, and not the recordings with a jump every five seconds.
+# Classes without a shift. The flat floor is left out, because it does not determine the height, and
+# so is the class with a jump every five seconds.
 WATCHED = tuple(
     name for name in CLASSES if name not in ("flat_agv", "hand_mixture_30s")
 )
 
+# Classes with a shift, by motion.
 SHIFTED = {
     "hand-held": ("hand_gm_1s", "hand_vio_walk"),
     "AGV": ("agv_ramps", "agv_long"),
     "car": ("car_ins_lidar", "car_two_slams"),
 }
+# Sizes of shifts (m or rad).
 SHIFTS = {
     "0.5 deg": np.radians(0.5),
     "2 deg": np.radians(2.0),
     "1 cm": 0.01,
     "5 cm": 0.05,
 }
+# Durations before and after a shift (s).
 _BEFORE_S = 900.0
 _AFTER_S = 1800.0
 
-# The monitor takes no more poses a second than this.
+# Largest rate of the poses for the monitor (Hz).
 _RATE_HZ = 10.0
 
 _SECOND_NS = 1_000_000_000
@@ -47,42 +52,44 @@ _MOUNT_SEED = 11
 
 @dataclass(frozen=True)
 class Watched:
-    """What the monitor said in so many hours without any shift: alarms, and which shift (6,) ten
-    minutes would show.
-    """
+    """Output of the monitor for a mount without a shift."""
 
+    # Class of the recordings, and their duration (hours).
     name: str
     hours: float
+    # Number of false alarms.
     alarms: int
+    # Shift (6,) that the monitor would detect in ten minutes (m, rad).
     visible: FloatArray
 
 
 @dataclass(frozen=True)
 class Delay:
-    """Seconds of driving until a shift was seen; infinite if it was not within half an hour."""
+    """Delay until the monitor detected a shift of the mount."""
 
+    # Motion, and size of the shift.
     kind: str
     size: str
+    # Motion (s) from the shift to its detection; infinite without detection in half an hour.
     seconds: float
-    # The smallest shift along or about that direction that ten minutes of motion would show, as the
-    # monitor says beforehand, over the shift.
+    # Smallest shift on this axis that the monitor declared detectable in ten minutes, divided by
+    # the shift.
     announced: float
 
 
 def _pieces(
     name: str, seed: int, X: FloatArray, duration_s: float
 ) -> Iterator[PosePairs]:
-    """Synchronised poses of a class that follow each other, with this extrinsic."""
+    """Yield the synchronised poses of recordings of a class that follow each other."""
     rate_hz = min(CLASSES[name].rate_hz, _RATE_HZ)
     kind = dataclasses.replace(
         CLASSES[name], duration_s=min(duration_s, PIECE_S), rate_hz=rate_hz
     )
+    class_number = sorted(CLASSES).index(name)
     for number in range(round(duration_s / kind.duration_s)):
-        made = simulate(
-            kind, (_MOUNT_SEED, seed, number, sorted(CLASSES).index(name)), X
-        )
+        made = simulate(kind, (_MOUNT_SEED, seed, number, class_number), X)
         pairs = synchronise(made.parent, made.child, 0.5)
-        # Half a minute between the pieces: nothing runs across.
+        # The pieces are half a minute apart, so that no motion spans two pieces.
         later_ns = round(number * (kind.duration_s + 30.0)) * _SECOND_NS
         yield PosePairs(
             pairs.stamps_ns + later_ns, pairs.Ts_pw_p, pairs.Ts_cw_c
@@ -95,7 +102,7 @@ def _mount(name: str, seed: int) -> FloatArray:
 
 
 def _fed(monitor: MountMonitor, pairs: PosePairs) -> Iterator[None]:
-    """Give poses to the monitor as they come in, a second at a time."""
+    """Pass poses to the monitor second by second, as in a session; yield after each second."""
     edges = np.flatnonzero(np.diff(pairs.stamps_ns // _SECOND_NS, prepend=-1))
     for first, last in zip(edges, [*edges[1:], len(pairs)], strict=True):
         monitor.add(pairs[first:last])
@@ -103,7 +110,7 @@ def _fed(monitor: MountMonitor, pairs: PosePairs) -> Iterator[None]:
 
 
 def false_alarms(name: str, hours: float) -> Watched:
-    """Watch a mount that does not move."""
+    """Run the monitor on a mount that does not move."""
     X = _mount(name, 0)
     monitor = MountMonitor(X, np.zeros((6, 6)))
     for pairs in _pieces(name, 0, X, 3600.0 * hours):
@@ -136,13 +143,14 @@ def alarm_table(watched: Sequence[Watched]) -> str:
     hours = sum(drive.hours for drive in watched)
     alarms = sum(drive.alarms for drive in watched)
     return (
-        f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns: which shift "
-        f"ten minutes of such motion would show nine times out of ten.\n\n{markdown_table(rows)}"
+        f"{alarms} alarms in {hours:g} h of motion without a shift. The last columns contain the "
+        "shift that is detected within ten minutes of this motion, nine times out of ten."
+        f"\n\n{markdown_table(rows)}"
     )
 
 
 def delays(kind: str, seed: int) -> list[Delay]:
-    """How long each shift takes to be seen, along or about a direction drawn for each."""
+    """Return the delay until each shift is detected, along or about a random axis."""
     names = SHIFTED[kind]
     name = names[seed % len(names)]
     X = _mount(name, seed)
@@ -155,8 +163,11 @@ def delays(kind: str, seed: int) -> list[Delay]:
     rng = np.random.default_rng(seed)
     delays_of_kind = []
     for size, shift in SHIFTS.items():
-        axis = int(rng.integers(3)) + (3 if size.endswith("deg") else 0)
-        xi = np.kron(np.eye(2), X[:3, :3].T) @ (np.eye(6)[axis] * shift)
+        axis = int(rng.integers(3))
+        if size.endswith("deg"):
+            axis += 3
+        to_child = np.kron(np.eye(2), X[:3, :3].T)
+        xi = to_child @ (np.eye(6)[axis] * shift)
         announced = float(before.visible(600.0)[axis] / shift)
         seconds = _seconds_until_seen(
             copy.deepcopy(before), parts[n_before:], xi
@@ -180,7 +191,7 @@ def _seconds_until_seen(
 
 
 def delay_table(delays_measured: Sequence[Delay]) -> str:
-    """A row for every motion and shift."""
+    """Return a table with a row for each motion and shift."""
     rows = []
     for kind, size in dict.fromkeys(
         (delay.kind, delay.size) for delay in delays_measured
@@ -191,7 +202,7 @@ def delay_table(delays_measured: Sequence[Delay]) -> str:
             if (delay.kind, delay.size) == (kind, size)
         ]
         seconds = np.array([delay.seconds for delay in delays])
-        # The monitor announced that ten minutes would reveal a shift of this size.
+        # Shifts that the monitor had declared detectable in ten minutes.
         is_announced = np.array([delay.announced <= 1.0 for delay in delays])
         announced = seconds[is_announced]
         others = seconds[~is_announced]

@@ -1,8 +1,8 @@
-"""Does the session of a vehicle end well if the vehicle drives what the node asks for?
+"""Study of the end of a session of a vehicle that drives as the node asks.
 
-The vehicle drives in curves, and over a ramp of 7 deg every 31 s. A result comes every 4 s. The
-goal judges the results in turn, as in the node; other rules for the end are applied to the same
-results.
+The vehicle drives in curves, and over a ramp of 7 deg every 31 s. There is a result every 4 s. The
+goal of the node gets the results in turn and ends the session. Other rules for the end are applied
+to the same results.
 """
 
 from __future__ import annotations
@@ -20,33 +20,28 @@ from hand_eye_calib.online.live.goal import Goal
 from hand_eye_calib.online.live.solving import newest_pairs
 from reproduction.coverage.classes import CLASSES, simulate
 from reproduction.coverage.motions import agv_on_request
-from reproduction.session.stop import FACTORS, TARGET, Rule, Step, end_of, until
+from reproduction.session.stop import (
+    FACTORS,
+    TARGET,
+    Rule,
+    Step,
+    count_good_times,
+    end_of,
+    until,
+)
 from reproduction.writing import markdown_table
 
 # Classes of the errors, in turn.
 CLASSES_IN_TURN = ("agv_long", "agv_ramps")
 # Target in units of the default target: 4 cm and 0.6 deg.
 *_, FACTOR = FACTORS
-RULES = [
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=20.0,
-        longest_s=75.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=40.0,
-        longest_s=75.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=1.0,
-        shortest_s=45.0,
-        longest_s=75.0,
-    ),
-]
+# Share of the targets, share of the motion before, and the limits (s) of the further motion.
+_NUMBERS_OF_RULES = (
+    (1.0, 0.5, 20.0, 75.0),
+    (1.0, 0.5, 40.0, 75.0),
+    (1.0, 1.0, 45.0, 75.0),
+)
+RULES = [Rule(*numbers) for numbers in _NUMBERS_OF_RULES]
 
 # Ends (s) of the parts of a recording.
 _ENDS_S = np.arange(10.0, 176.1, 4.0)
@@ -63,11 +58,11 @@ class End:
     worst : float
         Largest error over its target; NaN for a session that did not end.
     wait_s : float
-        Motion (s) from the first of the last results within the targets to the end.
+        Motion (s) before the end in which all results were within the targets.
     n_times, n_good_times : int
-        Times left that the node reported before the end, and those within a factor of two.
+        Number of reports of the time left, and of those within a factor of two of the truth.
     change_s : float
-        Motion (s) with the advice to change the motion.
+        Motion (s) during which the node advised to change the motion.
     """
 
     rule: str
@@ -123,14 +118,10 @@ def _end_of_node(steps: Sequence[Step], newest: Sequence[Excitation]) -> End:
         progress = goal.add(step.calibration, step.seen, (), last_minute)
         motion_s = step.seen.motion_s
         if progress.done:
-            ratios = np.array(
-                [left_s / (motion_s - at_s) for at_s, left_s in times]
-            )
-            n_good_times = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
             row = End(
                 "",
                 n_times=len(times),
-                n_good_times=n_good_times,
+                n_good_times=count_good_times(times, motion_s),
                 change_s=change_s,
             )
             return _with_error(row, steps, index)

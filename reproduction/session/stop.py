@@ -91,74 +91,21 @@ class Rule(NamedTuple):
         return f"{self.of_target:g} of the target, {confirmation}"
 
 
-RULES = [
-    Rule(
-        of_target=0.7,
-        of_motion=0.0,
-        shortest_s=0.0,
-        longest_s=0.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.0,
-        shortest_s=0.0,
-        longest_s=0.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.0,
-        shortest_s=20.0,
-        longest_s=20.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.0,
-        shortest_s=30.0,
-        longest_s=30.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.0,
-        shortest_s=60.0,
-        longest_s=60.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=20.0,
-        longest_s=60.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=20.0,
-        longest_s=75.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=20.0,
-        longest_s=90.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=0.5,
-        shortest_s=20.0,
-        longest_s=np.inf,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=1.0,
-        shortest_s=20.0,
-        longest_s=90.0,
-    ),
-    Rule(
-        of_target=1.0,
-        of_motion=1.0,
-        shortest_s=20.0,
-        longest_s=np.inf,
-    ),
-]
+# Share of the targets, share of the motion before, and the limits (s) of the further motion.
+_NUMBERS_OF_RULES = (
+    (0.7, 0.0, 0.0, 0.0),
+    (1.0, 0.0, 0.0, 0.0),
+    (1.0, 0.0, 20.0, 20.0),
+    (1.0, 0.0, 30.0, 30.0),
+    (1.0, 0.0, 60.0, 60.0),
+    (1.0, 0.5, 20.0, 60.0),
+    (1.0, 0.5, 20.0, 75.0),
+    (1.0, 0.5, 20.0, 90.0),
+    (1.0, 0.5, 20.0, np.inf),
+    (1.0, 1.0, 20.0, 90.0),
+    (1.0, 1.0, 20.0, np.inf),
+)
+RULES = [Rule(*numbers) for numbers in _NUMBERS_OF_RULES]
 
 
 class Recorded(NamedTuple):
@@ -355,16 +302,24 @@ def _stops(
     if end is None:
         yield replace(stop, is_stuck=is_stuck)
     else:
-        end_s = steps[end].seen.motion_s
-        ratios = np.array(
-            [left_s / (end_s - motion_s) for motion_s, left_s in times]
-        )
-        n_good = int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
+        n_good = count_good_times(times, steps[end].seen.motion_s)
         yield replace(stop, n_times=len(times), n_good_times=n_good)
     for rule in RULES:
         yield _stop(
             recorded, str(rule), steps, factor, end_of(rule, steps, factor)
         )
+
+
+def count_good_times(times: Sequence[tuple[float, float]], end_s: float) -> int:
+    """Count the reports of the time left that are within a factor of two of the truth.
+
+    ``times`` contains the motion (s) and the reported time left (s); ``end_s`` is the motion at the
+    end.
+    """
+    ratios = np.array(
+        [left_s / (end_s - motion_s) for motion_s, left_s in times]
+    )
+    return int(((ratios >= 0.5) & (ratios <= 2.0)).sum())
 
 
 def end_of(rule: Rule, steps: Sequence[Step], factor: float) -> int | None:

@@ -1,5 +1,7 @@
-"""Several recordings of one rig: how much better is their common result, is its interval honest,
-and is a recording that does not belong named?
+"""Study of several recordings of one rig.
+
+How much more accurate is their common result, does its interval contain the truth, and is a
+recording after a knock of the mount detected?
 """
 
 import dataclasses
@@ -18,34 +20,40 @@ from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.extras.fleet.together import together
 from hand_eye_calib.offline.calibrate import calibrate
 from reproduction.coverage.classes import CLASSES, simulate
+from reproduction.coverage.measures import HALF_WIDTH_90
 from reproduction.recordings import Rig, Truth
 from reproduction.writing import markdown_table
 
-# Simulated rigs: recordings of so many seconds, whose mounts differ by this (m, rad) per axis times
-# a factor between 1/2 and 2 that is drawn for each rig.
+# Classes of the simulated rigs.
 SIMULATED = ("hand_vio_walk", "agv_ramps", "drone_gnss_vio", "car_ins_lidar")
+# Duration of a recording (s).
 _SECONDS = 90.0
+# Number of recordings of a rig.
 _RECORDINGS = 6
+# Scatter of the mount between recordings, per axis (m, rad). It is multiplied by a factor between
+# 1/2 and 2 that is drawn for each rig.
 _SCATTER = np.repeat([0.008, np.radians(0.12)], 3)
-# A recording that does not belong: of a mount that was knocked, in a direction that is drawn.
+# Shift of the mount of the recording after a knock, in a random direction.
 _KNOCK_M = 0.05
 _KNOCK_RAD = np.radians(2.0)
-_NORMAL_90 = 1.645
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Results of the recordings of one rig by their names, and what is known of it."""
+    """Results of the recordings of one rig by their names, and its true extrinsic."""
 
     rig: str
     results: Mapping[str, Calibration]
     truth: Truth | None
-    # Of the mount in each recording, which differs from that of the rig.
+    # True extrinsic of each recording of a simulated rig, whose mount scatters.
     own: Mapping[str, Truth] = field(default_factory=dict)
 
 
 def simulated(name: str, seed: int) -> dict[str, Any]:
-    """Plain results of the recordings of a simulated rig, its extrinsic, and those in each."""
+    """Calibrate the recordings of a simulated rig.
+
+    Returns plain values: results, the extrinsic of the rig, and the extrinsic of each recording.
+    """
     kind = dataclasses.replace(CLASSES[name], duration_s=_SECONDS)
     rng = np.random.default_rng((31, seed, sorted(CLASSES).index(name)))
     X = simulate(
@@ -69,7 +77,7 @@ def simulated(name: str, seed: int) -> dict[str, Any]:
 
 
 def real(rig: Rig, name: str) -> dict[str, Any]:
-    """Plain result of a recording."""
+    """Calibrate a real recording, and return its result as plain values."""
     recording = rig.recordings[name]
     return calibrate(
         recording.parent, recording.child, method="auto", **rig.options
@@ -81,7 +89,11 @@ def rigs_of(
     rigs: Iterable[Rig],
     records: Mapping[str, Any],
 ) -> Iterator[Recorded]:
-    """The rigs from what was solved: simulated ones by their names, recordings by ``RIG NAME``."""
+    """Yield the rigs with their results.
+
+    ``solved`` contains simulated rigs by name. ``records`` contains results of real recordings by
+    ``RIG NAME``. The last rig combines both odometries of EuRoC.
+    """
     for name, plain in solved.items():
         results = {
             key: Calibration.from_dict(document)
@@ -111,96 +123,99 @@ def rigs_of(
 
 
 def tables(rigs: Sequence[Recorded], seed: int) -> str:
-    """Errors and coverage by rig; and what is told of recordings that belong, and that do not."""
+    """Return a table of errors and coverage by rig, and a text about knocked recordings."""
     rng = np.random.default_rng((34, seed))
     kinds = dict.fromkeys(rig.rig for rig in rigs if rig.truth)
     rows = [
         _row(kind, [rig for rig in rigs if rig.rig == kind]) for kind in kinds
     ]
-    named = wrong = cases = accused = several = moved = pairs = 0
+    n_sets = 0
+    n_accused = 0
+    n_named = 0
+    n_wrong = 0
+    n_pairs = 0
+    n_moved = 0
     for rig in rigs:
         whole = [rig.results] if len(rig.results) > 3 else []
-        for some in (*whole, *_subsets(rig.results, 3)[:2]):
-            agreement = together(some).parts["together"]
-            several += 1
-            accused += agreement is not None and agreement.kind in (
-                "one off",
-                "moved",
-            )
-            foreign = str(rng.choice([*some]))
-            out = _left_out(
-                dict(some) | {foreign: _knocked(some[foreign], rng)}
-            )
-            cases = cases + 1
-            named = named + (out == {foreign})
-            wrong += bool(out - {foreign})
-        for couple in combinations(rig.results.values(), 2):
-            pairs = pairs + 1
-            moved = moved + (compare(couple).verdict == "moved")
+        for results in (*whole, *_subsets(rig.results, 3)[:2]):
+            n_sets += 1
+            agreement = together(results).parts["together"]
+            if agreement is not None:
+                n_accused += agreement.kind in ("one off", "moved")
+            knocked = str(rng.choice([*results]))
+            changed = {knocked: _knocked(results[knocked], rng)}
+            left_out = _left_out(dict(results) | changed)
+            n_named += left_out == {knocked}
+            n_wrong += bool(left_out - {knocked})
+        for pair in combinations(rig.results.values(), 2):
+            n_pairs += 1
+            n_moved += compare(pair).verdict == "moved"
     return (
-        f"{markdown_table(rows)}\n\nIn {cases} sets of three or six recordings, the mount of one "
+        f"{markdown_table(rows)}\n\nIn {n_sets} sets of three or six recordings, the mount of one "
         f"recording was knocked by {100 * _KNOCK_M:g} cm and {np.degrees(_KNOCK_RAD):g} deg. This "
-        f"recording is named in {named} sets, another one in {wrong}. In {several} sets without a "
-        f"knock, a recording is named in {accused}. `compare` calls {moved} of {pairs} pairs moved."
+        f"recording is named in {n_named} sets, another recording in {n_wrong}. In the same sets "
+        f"without the knock, a recording is named in {n_accused}. `compare` calls {n_moved} of "
+        f"{n_pairs} pairs moved."
     )
 
 
 def _subsets(
     results: Mapping[str, Calibration], count: int
 ) -> list[dict[str, Calibration]]:
-    return [
-        {name: results[name] for name in some}
-        for some in combinations(results, count)
-    ]
+    """Return all choices of ``count`` results, by name."""
+    subsets = []
+    for names in combinations(results, count):
+        subsets.append({name: results[name] for name in names})
+    return subsets
 
 
 def _row(kind: str, rigs: Sequence[Recorded]) -> dict[str, object]:
+    """Return the row of a rig: errors and coverage of one, three and six recordings."""
     row: dict[str, object] = {"rig": f"{kind} ({len(rigs)})"}
     for count, title in ((1, "one"), (3, "three"), (6, "six")):
         errors: list[list[float]] = []
         inside: list[bool] = []
         for rig in rigs:
-            assert rig.truth is not None
-            for some in _subsets(rig.results, count):
-                joint = (
-                    together(some) if count > 1 else next(iter(some.values()))
-                )
-                is_comparable = np.isfinite(rig.truth.sigmas) & np.isfinite(
-                    joint.sigmas_measured
-                )
-                error = deviation(
-                    joint.T_parent_child, rig.truth.T_parent_child
-                )
-                # One recording shows its own mount only: its interval is of that.
-                of = (
-                    rig.own.get(min(some), rig.truth)
-                    if count == 1
-                    else rig.truth
-                )
-                apart = deviation(joint.T_parent_child, of.T_parent_child)
-                stated = (
-                    joint.sigmas_measured
-                    if "simulated" in kind
-                    else joint.sigmas
-                )
-                sigmas = np.hypot(stated, rig.truth.sigmas)
-                inside.extend(
-                    (np.abs(apart) < _NORMAL_90 * sigmas)[is_comparable]
-                )
-                parts = np.split(error * is_comparable, 2)
-                errors.append([float(np.linalg.norm(axes)) for axes in parts])
-        words = ("-", "-")
+            for results in _subsets(rig.results, count):
+                sizes, flags = _errors_of(results, rig)
+                errors.append(sizes)
+                inside += flags
+        error_text = "-"
+        coverage_text = "-"
         if errors:
             metres, radians = np.median(errors, axis=0)
-            words = (
-                f"{1e3 * metres:.1f} mm, {np.degrees(radians):.3f} deg",
-                f"{100 * np.mean(inside):.0f} %",
-            )
-        row |= {
-            f"error of {title}": words[0],
-            f"90 % covers, {title}": words[1],
-        }
+            error_text = f"{1e3 * metres:.1f} mm, {np.degrees(radians):.3f} deg"
+            coverage_text = f"{100 * np.mean(inside):.0f} %"
+        row[f"error of {title}"] = error_text
+        row[f"90 % covers, {title}"] = coverage_text
     return row
+
+
+def _errors_of(
+    results: Mapping[str, Calibration], rig: Recorded
+) -> tuple[list[float], list[bool]]:
+    """Return the errors (m, rad) of the common result, and whether axes are in their intervals."""
+    assert rig.truth is not None
+    truth = rig.truth
+    (name, joint), *others = results.items()
+    own_truth = rig.own.get(name, truth)
+    if others:
+        joint = together(results)
+        own_truth = truth
+    is_known = np.isfinite(truth.sigmas)
+    is_comparable = is_known & np.isfinite(joint.sigmas_measured)
+    error = deviation(joint.T_parent_child, truth.T_parent_child)
+    sizes = [
+        float(np.linalg.norm(axes))
+        for axes in np.split(error * is_comparable, 2)
+    ]
+    # The interval of a single recording is about the mount during this recording.
+    own_error = deviation(joint.T_parent_child, own_truth.T_parent_child)
+    is_simulated = bool(rig.own)
+    stated = joint.sigmas_measured if is_simulated else joint.sigmas
+    sigmas = np.hypot(stated, truth.sigmas)
+    is_inside = np.abs(own_error) < HALF_WIDTH_90 * sigmas
+    return sizes, is_inside[is_comparable].tolist()
 
 
 def _left_out(results: Mapping[str, Calibration]) -> set[str]:
@@ -214,7 +229,7 @@ def _left_out(results: Mapping[str, Calibration]) -> set[str]:
 
 
 def _knocked(result: Calibration, rng: np.random.Generator) -> Calibration:
-    """The result that a recording would have given after a knock."""
+    """Return the result of a recording as if it were recorded after a knock of the mount."""
     directions: FloatArray = rng.standard_normal((2, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     xi = np.concatenate([_KNOCK_M * directions[0], _KNOCK_RAD * directions[1]])

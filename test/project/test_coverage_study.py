@@ -269,10 +269,7 @@ def test_the_page_names_what_is_wrong_in_confidence_and_wrong_findings():
         ],
         None,
     )
-    assert (
-        "1 of them are more than 3.3 standard deviations off and called USE:\n- S5 0"
-        in text
-    )
+    assert "an error above 3.3 standard deviations: 1.\n- S5 0" in text
     assert "Wrong findings in 1 of 2 clean recordings" in text
     assert "| hand_mixture_30s | 1 | scale 1 |" in text
 

@@ -29,7 +29,7 @@ ROWS = (38 * N_LEVELS + 2) * 6
 def made(identifier, folder, jobs=2):
     """What an experiment on the published data solved, and its files."""
     source = PublishedSource(find_folder(data_folder()))
-    results, files = command.made(identifier, source, folder, jobs)
+    results, files = command.solve_and_write(identifier, source, folder, jobs)
     return results.rows, files
 
 
