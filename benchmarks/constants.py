@@ -1,6 +1,8 @@
-"""``python -m benchmarks.constants --data-folder DATA``: what every constant of the adaptive search
-does, halved and doubled, on random platforms that are drawn anew, by poses and by positions alone,
-and on short real recordings. ``constants.csv`` is of seed 45343421.
+"""``python -m benchmarks.constants --data-folder DATA``: effect of the estimator's constants.
+
+Each constant is halved and doubled. The errors are measured on new recordings of random platforms,
+with poses and with positions alone, and on short real recordings. ``constants.csv`` was made with
+seed 45343421.
 """
 
 import dataclasses
@@ -18,13 +20,14 @@ from hand_eye_calib.extras.partial.position_tuning import (
 from reproduction.ablation import Case, outcome, real_cases, simulated_cases
 from reproduction.writing import seed_of, study_parser, write_csv
 
-# One recording of each family, none longer than this.
+# Families of real recordings; one recording of each is used.
 _FAMILIES = ("kitti", "zxl19")
+# Recordings with more poses are not used.
 _MOST_POSES = 1450
 
 
 def chosen(folder: Path | None, seed: int) -> list[Case]:
-    """One recording of every platform and of some real families."""
+    """Return a recording of every platform and of some real families."""
     real = [case for case in real_cases(folder) if case.family in _FAMILIES]
     first: dict[str, Case] = {}
     for case in (*simulated_cases(seed, 4), *real):
@@ -34,7 +37,7 @@ def chosen(folder: Path | None, seed: int) -> list[Case]:
 
 
 def changed(name: str, factor: float) -> PositionTuning:
-    """Multiply a constant by a factor; logarithms of variances are shifted instead."""
+    """Multiply a constant by a factor. Negative constants are logarithms, and are shifted."""
     value = getattr(TUNING, name)
     is_log = bool(np.min(value) < 0)
 
@@ -43,47 +46,50 @@ def changed(name: str, factor: float) -> PositionTuning:
             return max(round(factor * number), min(number, 1))
         return float(number + np.log(factor)) if is_log else factor * number
 
-    new_value = (
-        tuple(map(multiplied, value))
-        if isinstance(value, tuple)
-        else multiplied(value)
-    )
+    new_value: object
+    if isinstance(value, tuple):
+        new_value = tuple(multiplied(number) for number in value)
+    else:
+        new_value = multiplied(value)
     return dataclasses.replace(TUNING, **{name: new_value})
 
 
 def measured(
     cases: Sequence[Case], tuning: PositionTuning = TUNING
 ) -> FloatArray:
-    """Errors of translation and rotation, and squared errors over their variances (N, 3)."""
+    """Return errors of translation and rotation, and the mean squared error in sigmas (N, 3).
+
+    A simulated recording has a second row, for the positions of its child alone.
+    """
     rows = []
     for case in cases:
-        found = outcome(case, {"tuning": tuning})
-        rows.append(
-            [np.nan] * 3
-            if found is None
-            else [*found.errors, np.mean(found.in_sigmas**2)]
-        )
-        if not case.sigmas.any():
+        result = outcome(case, {"tuning": tuning})
+        row = [np.nan] * 3
+        if result is not None:
+            row = [*result.errors, np.mean(result.in_sigmas**2)]
+        rows.append(row)
+        is_simulated = not case.sigmas.any()
+        if is_simulated:
             poses = case.poses
-            measured_m = poses.Ts_cw_c[:, :3, 3]
-            lever = positions.solve(
-                poses.stamps_ns, poses.Ts_pw_p, measured_m, tuning=tuning
+            child_positions = poses.Ts_cw_c[:, :3, 3]
+            fit = positions.solve(
+                poses.stamps_ns, poses.Ts_pw_p, child_positions, tuning=tuning
             )
-            off = lever.lever_arm - case.T_parent_child[:3, 3]
-            square = float(off @ np.linalg.solve(lever.covariance, off)) / 3.0
-            rows.append([float(np.linalg.norm(off)), np.nan, square])
+            error = fit.lever_arm - case.T_parent_child[:3, 3]
+            nees = float(error @ np.linalg.solve(fit.covariance, error))
+            rows.append([float(np.linalg.norm(error)), np.nan, nees / 3.0])
     return np.array(rows)
 
 
 def main() -> None:
-    """Draw, solve and write ``constants.csv``."""
+    """Draw recordings, solve them with all constants, and write ``constants.csv``."""
     parser = study_parser("benchmarks.constants", __doc__)
     parser.add_argument(
-        "--seed", type=int, help="default: another one at every run"
+        "--seed", type=int, help="default: a random seed at every run"
     )
     arguments = parser.parse_args()
     cases = chosen(arguments.data_folder, seed_of(arguments.seed))
-    whole = measured(cases)
+    usual = measured(cases)
     rows = []
     for field in dataclasses.fields(TUNING)[1:]:
         row: dict[str, object] = {
@@ -92,7 +98,8 @@ def main() -> None:
         }
         largest = 0.0
         for title, factor in (("halved", 0.5), ("doubled", 2.0)):
-            logs = np.log(measured(cases, changed(field.name, factor)) / whole)
+            ratios = measured(cases, changed(field.name, factor)) / usual
+            logs = np.log(ratios)
             row[f"{title}: error"] = f"{np.exp(np.nanmean(logs[:, :2])):.3f}"
             row[f"{title}: NEES"] = f"{np.exp(np.nanmean(logs[:, 2])):.3f}"
             largest = max(largest, float(np.nanmax(np.abs(np.expm1(logs)))))

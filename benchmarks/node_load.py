@@ -1,18 +1,19 @@
-"""Load, soak and crashes of the node, measured.
+"""Measure the node under load, over hours, and after crashes.
 
     OMP_NUM_THREADS=1 python benchmarks/node_load.py [load] [share] [busy] [soak] [kill]
     [--seconds 60] [--hours 10] [--kills 20]
 
-load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: messages
-       lost, latency of the callbacks, CPU
-share  the same with a share of a core for the node and for its solving process (cgroups v1), every
-       solve taking two seconds of pure Python
-busy   the same while other programs load all cores: messages lost against messages reported lost
-soak   10 hours of 2 x 100 Hz, simulated, through the engine: memory and solve time hour by hour
-kill   kill -9 of the node at random moments, and resuming: what is lost
+load   two Odometry streams at 400 Hz for a minute, DNLO on 5,000 pairs every second: lost
+       messages, latency of the callbacks, CPU
+share  as load, but the node and its solving process get a share of a core each (cgroups v1), and
+       every solve takes two seconds of pure Python
+busy   as load, with slow solves, while other programs load all cores: lost messages, and lost
+       messages that the node reports
+soak   10 simulated hours of 2 x 100 Hz in the engine: memory and solve time of every hour
+kill   kill -9 of the node at random moments, and restarts: lost poses
 
-Prints a table per part and fails (exit code 1) where a promise is broken. Latency is from just
-before ``publish()`` in one process to the beginning of the callback in the other.
+Prints a table for each part. The exit code is 1 if a promise is broken. Latency is the time from
+just before ``publish()`` in one process to the beginning of the callback in the other process.
 """
 
 import argparse
@@ -52,19 +53,25 @@ from hand_eye_calib.formats.results import load_result, save_result  # noqa: E40
 
 PARTS = ("load", "share", "busy", "soak", "kill")
 
+# Largest 99th percentile of the latency (s).
 MOST_LATENCY_S = 0.010
+# The same for a node with a share of a core (s).
 MOST_LATENCY_OF_A_SHARE_S = 0.030
+# Largest difference of the reported number of lost messages, as a share of the lost messages.
 MOST_UNREPORTED = 0.02
+# Largest growth of the memory during the soak.
 MOST_GROWTH = 0.10
+# Longest time (s) of poses that a crash may lose.
 MOST_LOST_S = 1.0
-# A solve after hours may take so much longer than after one: other programs run on the machine.
+# Largest ratio of the solve times after the last and the first hour. Other programs may run on the
+# machine.
 MOST_SLOWDOWN = 1.5
 
 
 # ---------------------------------------------------------------------- load
 
 
-# Set for a node whose solves take two seconds of pure Python.
+# Environment variable for a node whose solves take two seconds of pure Python.
 SLOW = "HAND_EYE_CALIB_SLOW"
 SLOW_SOLVER = """
 import time
@@ -82,9 +89,7 @@ solving.main()
 
 
 def measured_node(report, arguments):
-    """The node as it is, with a stopwatch at its pose callback; writes what it saw when it is told
-    to end.
-    """
+    """Run the node, and measure its pose callback; write a report when the node stops."""
     from hand_eye_calib.online.live import cycle
     from hand_eye_calib.online.live.solving import SolvingProcess
     from hand_eye_calib.online.ros.calibrator_node import CalibratorNode
@@ -126,7 +131,7 @@ def measured_node(report, arguments):
         result = self._cycle.result
         document = {
             "received": len(latencies),
-            "lost_as_reported": sum(each._lost for each in self._inputs),
+            "lost_as_reported": sum(topic._lost for topic in self._inputs),
             "cpu": (end_cpu_s - start_cpu_s) / (end_s - start_s),
             "latency": np.percentile(latencies, [50, 99, 99.9, 100]).tolist(),
             "duration": np.percentile(durations, [50, 99, 99.9, 100]).tolist(),
@@ -144,7 +149,10 @@ def measured_node(report, arguments):
 
 
 def place_of_sending_time():
-    """Where in the bytes of a message of either stream the publisher's clock is."""
+    """Return the position of the sending time in the bytes of a message, equal for both streams.
+
+    The publisher writes its clock into the first number of the pose's covariance.
+    """
     from nav_msgs.msg import Odometry
     from rclpy.serialization import serialize_message
 
@@ -159,22 +167,19 @@ def place_of_sending_time():
 
 
 def cpu_seconds():
-    """Of this process and of the one that solves for it."""
+    """Return the processor time (s) of this process and of its children."""
     ticks = 0
     for pid in (os.getpid(), *children(os.getpid())):
-        with contextlib.suppress(FileNotFoundError):  # it has just been killed
-            stat = (
-                Path(f"/proc/{pid}/stat")
-                .read_text(encoding="ascii")
-                .rpartition(")")[2]
-                .split()
-            )
-            ticks += int(stat[11]) + int(stat[12])
+        # A child may have ended just now.
+        with contextlib.suppress(FileNotFoundError):
+            text = Path(f"/proc/{pid}/stat").read_text(encoding="ascii")
+            fields = text.rpartition(")")[2].split()
+            ticks += int(fields[11]) + int(fields[12])
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
 def publish(publishers, first, n_poses, rate_hz):
-    """Publish poses number ``first`` to ``first + n_poses`` of both streams on time."""
+    """Publish the poses ``first`` to ``first + n_poses`` of both streams in real time."""
     from nav_msgs.msg import Odometry
 
     message = Odometry()
@@ -198,11 +203,11 @@ def publish(publishers, first, n_poses, rate_hz):
 
 
 def publish_alone(rate_hz, n_poses):
-    """Publish everything once the node listens; the process of its own."""
+    """Publish all poses when the node has subscribed; main function of the publisher's process."""
     from ros_harness import Peer
 
-    # A sensor is on time whatever else this machine does: messages that were held up would come all
-    # at once, and the last of them wait.
+    # The publisher gets real-time priority, because a sensor is never late. Late messages would
+    # arrive in bursts, and wait for each other.
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
     peer = Peer(int(os.environ["ROS_DOMAIN_ID"]))
@@ -210,13 +215,14 @@ def publish_alone(rate_hz, n_poses):
     peer.wait_matched(*publishers)
     time.sleep(0.5)
     publish(publishers, 0, n_poses, rate_hz)
-    time.sleep(4.0)  # a node that is behind has this to catch up
+    # Time for the node to process its queue.
+    time.sleep(4.0)
     peer.close()
     return 0
 
 
 def start(domain, *words, **more):
-    """Another process of this file."""
+    """Start this file in another process."""
     environment = {
         "ROS_DOMAIN_ID": str(domain),
         "OMP_NUM_THREADS": "1",
@@ -229,18 +235,19 @@ def start(domain, *words, **more):
 
 
 def children(pid):
-    """Processes that a process has started."""
-    found = []
+    """Return the numbers of the processes that a process has started."""
+    pids = []
     for task in Path(f"/proc/{pid}/task").iterdir():
-        with contextlib.suppress(OSError):  # a thread that has just ended
-            found += map(
-                int, (task / "children").read_text(encoding="ascii").split()
-            )
-    return found
+        # A thread may have ended just now.
+        with contextlib.suppress(OSError):
+            text = (task / "children").read_text(encoding="ascii")
+            pids += [int(word) for word in text.split()]
+    return pids
 
 
-# Time used is charged at the kernel's tick, often 4 ms apart, and when another program wakes up on
-# that core: without these, a program that has used up its share of 5 ms ran 4 and stood still 16.
+# Program that wakes up every millisecond on a core. The kernel accounts processor time at its tick,
+# often every 4 ms, and whenever another program wakes up. Without such a program, a process with a
+# quota per 5 ms ran for 4 ms and then paused for 16 ms.
 WAKES_UP = """
 import os, sys, time
 os.sched_setaffinity(0, [int(sys.argv[1])])
@@ -251,7 +258,10 @@ while True:
 
 
 def slow_processor(node, share):
-    """Give the node, and its solving process, a share of a core each; undoes that."""
+    """Limit the node and its solving process to a share of a core each.
+
+    Returns a function that removes the limits.
+    """
     groups = []
     own = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
     here = next(line.rpartition(":")[2] for line in own if ":cpu:" in line)
@@ -262,7 +272,7 @@ def slow_processor(node, share):
     for pid in (node.pid, *children(node.pid)):
         group = Path(f"/sys/fs/cgroup/cpu{here}/slow_{pid}")
         group.mkdir()
-        # Short periods: a slow processor does not stop for long either.
+        # Periods are short, because a slow processor never pauses for long.
         (group / "cpu.cfs_period_us").write_text("5000")
         (group / "cpu.cfs_quota_us").write_text(str(round(5000 * share)))
         (group / "cgroup.procs").write_text(str(pid))
@@ -286,7 +296,7 @@ def slow_processor(node, share):
 
 
 def others(count):
-    """Programs that load all cores, at the usual priority; ends them."""
+    """Start programs that load all cores; return a function that ends them."""
     busy = [
         subprocess.Popen([sys.executable, "-c", "while True: pass"])
         for _ in range(count)
@@ -295,15 +305,16 @@ def others(count):
 
 
 def end(programs):
-    """End programs that never end by themselves."""
-    for each in programs:
-        each.kill()
-        each.wait()
+    """Kill programs."""
+    for program in programs:
+        program.kill()
+        program.wait()
 
 
 def loaded_node(folder, name, seconds, disturb=None, **environment):
-    """What the node saw of two streams at 400 Hz; ``disturb(node)`` makes life hard for it, and
-    returns what undoes that.
+    """Run a node with two streams at 400 Hz, and return its report.
+
+    ``disturb(node)`` slows the node down, and returns a function that ends the disturbance.
     """
     from ros_harness import free_domain
 
@@ -316,14 +327,13 @@ def loaded_node(folder, name, seconds, disturb=None, **environment):
         "solve_period": 1.0,
         "max_pairs": 5005,
         "output_directory": folder / name,
-        "report": "false",  # it would load the machine in the next part
+        # A report would load the machine in the next part.
+        "report": "false",
     }
-    given = [
-        word
-        for option, value in options.items()
-        for word in ("-p", f"{option}:={value}")
-    ]
-    words = ("--node", report, "--ros-args", "--log-level", "warn", *given)
+    parameters = []
+    for option, value in options.items():
+        parameters += ["-p", f"{option}:={value}"]
+    words = ("--node", report, "--ros-args", "--log-level", "warn", *parameters)
     node = start(domain, *words, **environment)
     undo = disturb(node) if disturb else lambda: None
     n_poses = round(seconds * rate_hz)
@@ -337,28 +347,39 @@ def loaded_node(folder, name, seconds, disturb=None, **environment):
         ended_s = time.monotonic() - begun
     finally:
         node.kill()
-    seen = json.loads(report.read_text(encoding="utf-8"))
-    return seen | {"published": 2 * n_poses, "ended_s": ended_s, "code": code}
+    measured = json.loads(report.read_text(encoding="utf-8"))
+    return measured | {
+        "published": 2 * n_poses,
+        "ended_s": ended_s,
+        "code": code,
+    }
 
 
-def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
-    """Rows (what, value, promise, kept) of the node under load."""
-    latency = seen["latency"]
-    code = seen["code"]
-    lost = seen["published"] - seen["received"]
-    reported = seen["lost_as_reported"]
+def load(measured, most_latency_s=MOST_LATENCY_S, may_lose=False):
+    """Return rows of the node under load: title, value, promise, whether the promise is kept."""
+    latency = measured["latency"]
+    code = measured["code"]
+    published = measured["published"]
+    solves = measured["solves"]
+    lost = published - measured["received"]
+    reported = measured["lost_as_reported"]
     is_reported = abs(lost - reported) <= MOST_UNREPORTED * lost
-    quick = latency[1] < most_latency_s
-    promised = f"p99 < {1000 * most_latency_s:.0f}"
-    callbacks = _ms(seen["duration"])
-    last = f"{seen['pairs']}, {seen['error']:.2f}"
+    is_quick = latency[1] < most_latency_s
+    promise = f"p99 < {1000 * most_latency_s:.0f}"
+    callbacks = _ms(measured["duration"])
+    last = f"{measured['pairs']}, {measured['error']:.2f}"
     rows = [
-        ("messages lost", f"{lost} of {seen['published']}", "0", lost == 0),
-        ("latency p50 / p99 / p99.9 / max (ms)", _ms(latency), promised, quick),
-        ("solves", str(seen["solves"]), "> 0", seen["solves"] > 0),
+        ("messages lost", f"{lost} of {published}", "0", lost == 0),
+        (
+            "latency p50 / p99 / p99.9 / max (ms)",
+            _ms(latency),
+            promise,
+            is_quick,
+        ),
+        ("solves", str(solves), "> 0", solves > 0),
     ]
     if may_lose:
-        rows = [(what, value, "", True) for what, value, _, _ in rows]
+        rows = [(title, value, "", True) for title, value, _, _ in rows]
     return [
         *rows,
         (
@@ -368,11 +389,11 @@ def load(seen, most_latency_s=MOST_LATENCY_S, may_lose=False):
             is_reported,
         ),
         ("callback p50 / p99 / p99.9 / max (ms)", callbacks, "", True),
-        ("CPU (cores)", f"{seen['cpu']:.2f}", "", True),
-        ("pairs, error (mm) of the last", last, "", True),
+        ("CPU (cores)", f"{measured['cpu']:.2f}", "", True),
+        ("pairs, error (mm) of the last result", last, "", True),
         (
             "end after Ctrl-C (s), code",
-            f"{seen['ended_s']:.2f}, {code}",
+            f"{measured['ended_s']:.2f}, {code}",
             "code 0",
             code == 0,
         ),
@@ -387,7 +408,7 @@ def _ms(values):
 
 
 def soak(hours):
-    """Rows of the engine fed for hours."""
+    """Feed the engine with poses for simulated hours; return the rows of memory and times."""
     rate_hz = 100
     minute = 6000
     calibrator = Calibrator(CalibratorConfig(reference="B5"))
@@ -415,10 +436,10 @@ def soak(hours):
         history.append(
             (resident_mb(), 1e3 * float(np.median(solves)), 1e6 * p99)
         )
-        said = "{:.1f} MB, solve {:.0f} ms, per pose p99 {:.1f} us".format(
+        text = "{:.1f} MB, solve {:.0f} ms, per pose p99 {:.1f} us".format(
             *history[-1]
         )
-        print(f"hour {hour + 1}: {said}, {result.n_poses} poses", flush=True)
+        print(f"hour {hour + 1}: {text}, {result.n_poses} poses", flush=True)
     first_mb, first_ms, _ = history[0]
     last_mb, last_ms, _ = history[-1]
     memory = f"{first_mb:.1f}, {last_mb:.1f}"
@@ -441,7 +462,7 @@ def soak(hours):
 
 
 def resident_mb():
-    """Memory of this process, without what the allocator only keeps for later."""
+    """Return the memory (MB) of this process, without free memory of the allocator."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
@@ -456,7 +477,7 @@ def resident_mb():
 
 
 def kill(folder, kills):
-    """Rows of the node killed and resumed."""
+    """Kill and resume the node; return the rows of lost poses and files."""
     from ros_harness import NodeProcess, Peer, free_domain
 
     rate_hz = 100
@@ -513,7 +534,7 @@ def kill(folder, kills):
     lost = f"{np.mean(lost_s):.3f}, {max(lost_s):.3f}"
     return [
         (
-            "sessions resumed with all of it",
+            "sessions resumed with all their poses",
             f"{resumed} of {kills}",
             "all",
             resumed == kills,
@@ -531,21 +552,22 @@ def kill(folder, kills):
 
 
 def newest(journal, stream):
-    """Newest stamp of a stream in a journal; 0 without any."""
+    """Return the newest stamp of a stream in a journal; 0 without poses."""
     return int(journal.stamps_ns[journal.streams == stream].max(initial=0))
 
 
 def has_poses_since(directory, stamp_ns):
-    """Whether the node has noted poses of both streams from this stamp on."""
+    """Return whether the journal contains poses of both streams from this stamp on."""
     try:
         journal = read_journal(directory)
-    except InputError:  # not there yet
+    # The journal does not exist yet.
+    except InputError:
         return False
     return all(newest(journal, stream) >= stamp_ns for stream in STREAMS)
 
 
 def earlier_result():
-    """A calibration of another day."""
+    """Return a result to save before the sessions."""
     calibrator = Calibrator(CalibratorConfig(reference="B5"))
     for stream, columns in parts(0, 300, 10).items():
         for pose in zip(*columns, strict=True):
@@ -554,6 +576,7 @@ def earlier_result():
 
 
 def fingerprints(folder):
+    """Return the SHA-256 digest of each file in a folder, by name."""
     files = [path for path in folder.iterdir() if path.is_file()]
     return {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest()
@@ -565,28 +588,31 @@ def fingerprints(folder):
 
 
 def main(arguments):
-    """Run the parts that were asked for; exit code."""
+    """Run the parts in the arguments, and return the exit code."""
     if arguments[:1] == ["--node"]:
         return measured_node(Path(arguments[1]), arguments[2:])
     if arguments[:1] == ["--publish"]:
         return publish_alone(int(arguments[1]), int(arguments[2]))
     parser = argparse.ArgumentParser(
-        description="Load, soak and crashes of the node, measured."
+        description="Measure the node under load, over hours, and after crashes."
     )
     parser.add_argument(
-        "parts", nargs="*", choices=[*PARTS, []], help="all by default"
+        "parts", nargs="*", choices=[*PARTS, []], help="default: all parts"
     )
     parser.add_argument(
-        "--seconds", type=float, default=60.0, help="length of a load"
+        "--seconds",
+        type=float,
+        default=60.0,
+        help="duration of load, share and busy (s)",
     )
     parser.add_argument(
-        "--hours", type=int, default=10, help="length of soak, simulated"
+        "--hours", type=int, default=10, help="simulated duration of soak (h)"
     )
     parser.add_argument(
-        "--kills", type=int, default=20, help="how often to kill the node"
+        "--kills", type=int, default=20, help="number of kills of the node"
     )
     parser.add_argument(
-        "--share", type=float, default=0.4, help="of a core, for share"
+        "--share", type=float, default=0.4, help="share of a core, for share"
     )
     options = parser.parse_args(arguments)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -599,26 +625,30 @@ def main(arguments):
         if part == "load":
             return load(loaded_node(folder, part, options.seconds))
         if part == "share":
-            hard = functools.partial(slow_processor, share=options.share)
-            seen = loaded_node(
-                folder, part, options.seconds, hard, **{SLOW: "1"}
+            slow_down = functools.partial(slow_processor, share=options.share)
+            measured = loaded_node(
+                folder, part, options.seconds, slow_down, **{SLOW: "1"}
             )
-            return load(seen, MOST_LATENCY_OF_A_SHARE_S)
+            return load(measured, MOST_LATENCY_OF_A_SHARE_S)
         n_programs = 4 * (os.cpu_count() or 1)
-        hard = lambda _: others(n_programs)  # noqa: E731
-        return load(
-            loaded_node(folder, part, options.seconds, hard, **{SLOW: "1"}),
-            may_lose=True,
+        measured = loaded_node(
+            folder,
+            part,
+            options.seconds,
+            lambda _: others(n_programs),
+            **{SLOW: "1"},
         )
+        return load(measured, may_lose=True)
 
-    good = True
+    are_kept = True
     with tempfile.TemporaryDirectory() as name:
         for part in options.parts or PARTS:
-            rows = run(part, Path(name))
-            good &= all(kept for *_, kept in rows)
-            lines = [[*line, "" if kept else "BROKEN"] for *line, kept in rows]
+            lines = []
+            for *texts, is_kept in run(part, Path(name)):
+                are_kept = are_kept and is_kept
+                lines.append([*texts, "" if is_kept else "BROKEN"])
             show([Table(part, ["measured", "promised", ""], lines)])
-    return 0 if good else 1
+    return 0 if are_kept else 1
 
 
 if __name__ == "__main__":

@@ -3,13 +3,13 @@
     python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY] [--seed SEED]
 
 Twelve sessions are a minute or two of simulated driving, published in real time, with one accident
-(a knock, a stream that stops, a wrong ``installed`` ...). Two are ten minutes of a vehicle that
-drives over ramps: its advice and times left are compared with what happens. A witness records the
-state of the node, its topics, ``/diagnostics``, ``/tf_static``, the page of ``watch``, the log and
-the saved files. They are compared at every second, and every screen with the rules of
-``test/screen_rules.py``. Prints a table
-and fails (exit code 1) at a contradiction, or if a session does not end as it should. With
-``--out``, all pages and headlines are kept (``watch_picture.py`` makes a moving picture of them).
+(a knock, a stream that stops, a wrong ``installed`` ...). In two sessions, a vehicle drives over
+ramps for ten minutes. The node's advice and times left are compared with the rest of the session. A
+witness records the state of the node, its topics, ``/diagnostics``, ``/tf_static``, the page of
+``watch``, the log and the saved files. Their contents are compared at every second, and every
+screen with the rules of ``test/screen_rules.py``. Prints a table. The exit code is 1 if contents
+contradict each other, or a session does not end as expected. With ``--out``, all pages and
+headlines are saved (``watch_picture.py`` makes a moving picture of them).
 """
 
 import argparse
@@ -74,14 +74,14 @@ from reproduction.coverage.motions import RAMP_PERIOD_S, agv_on_request  # noqa:
 # Seed of the drive of the first session; the next session has the next seed.
 SEED = 5800
 
-# Time (s) after a state within which the page must display it: the page looks every 0.25 s, and
+# Time (s) within which the page must display a new state: the page is updated every 0.25 s, and
 # the machine may be loaded.
 SETTLED_S = 2.0
 
 # Time (s) that the publisher's process takes to start.
 START_S = 6.0
 
-# Motion before which there must be neither a verdict nor advice.
+# Motion (s, deg) before which the headline must be neither DONE nor an advice to change the motion.
 MIN_MOTION_S = 20.0
 MIN_ROTATION_DEG = 30.0
 
@@ -120,9 +120,10 @@ class Session:
     ends_with : str
         Regular expression for the last headline before the node is stopped.
     rates_hz : (float, float)
-        Of parent and child.
+        Rates of parent and child, Hz.
     parameters : dict
-        Of the node. An ``installed`` is replaced by a transform that is wrong by 15 cm and 4 deg.
+        Parameters of the node. If ``installed`` is among them, its value is replaced by a transform
+        that is wrong by 15 cm and 4 deg.
     accident : callable or None
         Changes the streams.
     load : int
@@ -328,7 +329,7 @@ def simulated(session, seed):
     )
     if session.accident:
         session.accident(streams)
-    # Jumps belong to the time, not to the messages: a fast odometry does not jump more often.
+    # The number of jumps per second does not depend on the rate of the messages.
     jumps_per_pose = REALISTIC.outliers * HILLY_DRIVE.parent_rate / parent_hz
     streams.Ts_parent, streams.Ts_child = add_noise(
         streams.Ts_parent,
@@ -514,18 +515,18 @@ def contradictions(witness, start_s, end_s):
         if before is None or not essence(before[1]) == essence(
             state_record[1]
         ) == essence(after[1]):
-            continue  # one surface may be ahead of another for a moment
-        yield from (
-            (second, text)
-            for text in itertools.chain(
-                compare_page(page_record[1], state_record[1]),
-                compare_topics(witness, state_record[1], now_s),
-            )
+            # One surface may be ahead of another for a moment.
+            continue
+        texts = itertools.chain(
+            compare_page(page_record[1], state_record[1]),
+            compare_topics(witness, state_record[1], now_s),
         )
+        for text in texts:
+            yield second, text
 
 
 def essence(state):
-    """Return what may not change while surfaces are compared."""
+    """Return the part of a state that must be constant while surfaces are compared."""
     result = state.result
     progress = state.progress.progress if state.progress else None
     return (
@@ -629,7 +630,7 @@ def compare_topics(witness, state, now_s):
     broadcast = newest(witness.broadcasts, now_s)
     sending = state.extrinsic.tf_static if state.extrinsic else Broadcast.OFF
     is_on = sending is Broadcast.ON
-    # A program that has received the transform keeps it when the node sends it no longer.
+    # The last message of a latched topic stays, also after the node has withdrawn the transform.
     was_sent = sending in (Broadcast.ON, Broadcast.WITHDRAWN)
     if was_sent != bool(broadcast) and state.standing is Standing.CURRENT:
         yield f"/tf_static is {sending.value}, transform sent: {bool(broadcast)}"
@@ -655,7 +656,7 @@ def not_logged(witness, log):
 
 
 def view_of(state):
-    """Return what ``watch`` displays of a state that has just arrived."""
+    """Return the view of ``watch`` for a state that has just arrived."""
     board = Board()
     board.take(state, 0.0)
     return board.view(0.5)
@@ -663,7 +664,7 @@ def view_of(state):
 
 @dataclass(frozen=True)
 class Promises:
-    """What a session of a vehicle has promised to its driver.
+    """Advice and times left in a session of a vehicle, compared with the rest of the session.
 
     Attributes
     ----------
@@ -672,7 +673,8 @@ class Promises:
     change_s : float
         Time (s) with CHANGE THE MOTION while the vehicle drives over ramps.
     n_times, n_good_times : int
-        Seconds with a time left before DONE, and those within a factor of two of what was left.
+        Seconds with a report of the time left before DONE, and those within a factor of two of the
+        truth.
     """
 
     wait_s: float
@@ -691,7 +693,7 @@ class Promises:
 
 
 def promises(witness, start_s, end_s, flat_s):
-    """Compare the advice of a session of a vehicle with what has happened."""
+    """Compare the advice and times left of a session with the rest of the session."""
     seconds = range(int(end_s - start_s))
     records = [newest(witness.states, start_s + second) for second in seconds]
     progress = {
@@ -823,7 +825,7 @@ def spin_to(peer, end_s):
 
 
 def publish(streams, start_s, session):
-    """Publish both streams in real time, in a process of its own that is never late."""
+    """Publish both streams in real time; main function of a process with real-time priority."""
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
     peer = Peer(int(os.environ["ROS_DOMAIN_ID"]))
@@ -863,7 +865,11 @@ def start_publishing(domain, streams, start_s, session):
 
 
 def row_of(witness, start_s, end_s, last, T_parent_child):
-    """Return the row of the table: times of the first result and DONE, flips, last headline."""
+    """Return the row of the table, and the witness.
+
+    The row contains the times of the first result and of DONE, the numbers of changes of verdict
+    and headline, the error, and the last headline.
+    """
     during = [
         (t, state) for t, state in witness.states if start_s <= t <= end_s
     ]

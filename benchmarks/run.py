@@ -2,21 +2,23 @@
 
     OMP_NUM_THREADS=1 python benchmarks/run.py [--full] [--page FILE] [--update]
 
-One thread, because the matrices are small: the idle threads of a BLAS pool would widen the spread
-and save nothing. Processor time, so that other programs on the machine count little; of whole
-processes the wall time as well. Each row is the median of several repeats, with half their range
-beside it.
+The benchmarks use one thread: the matrices are small, and idle threads of a BLAS pool would only
+scatter the times. They measure processor time, which other programs hardly change. For whole
+processes, they also measure wall time. A row is the median of several repeats, with half of their
+range.
 
-Times depend on the machine, so what is compared with ``baseline.json`` are ratios within this one
-run: how many times faster the fast backend is than CasADi + Ipopt and OpenCV on the same pairs,
-how near everything is to the floor, one pass of numpy over the same bytes, and whether the fast
-backend ends no higher than Ipopt. A crash, a ratio that is missing or below a third of the
-baseline's is a failure (exit code 1). ``--update`` writes a new baseline, of a run without
-``--full``.
+Times depend on the machine, so only ratios within this run are compared with ``baseline.json``:
 
-The 443 and 2,338 pairs are reference B5 of the two KITTI drives of Valimaki et al. 2023 where the
-published data is found in ``$HAND_EYE_CALIB_DATA`` or ``../shared/data``, otherwise of simulated
-drives of these lengths.
+- how many times faster the fast backend is than CasADi + Ipopt, and than OpenCV, on the same pairs;
+- how near each row is to the floor, which is one pass of numpy over the same bytes.
+
+The objective of the fast backend must not be above that of Ipopt. The exit code is 1 after a
+crash, or if a ratio is missing or below a third of the baseline's. ``--update`` writes a new
+baseline, from a run without ``--full``.
+
+443 and 2,338 are the numbers of pairs of reference B5 in the two KITTI drives of Valimaki et al.
+2023. Without the published data in ``$HAND_EYE_CALIB_DATA`` or ``../shared/data``, simulated drives
+of the same lengths are used.
 """
 
 import argparse
@@ -41,22 +43,22 @@ FULL = (1_000_000,)
 
 
 def everything(is_full):
-    """Where the drives come from, all rows, and the memory by number of pairs."""
+    """Return the source of the drives, all rows, and the memory by number of pairs."""
     sizes = USUAL + (FULL if is_full else ())
-    source, found = drives(sizes)
+    source, drive_of_size = drives(sizes)
     measured = []
-    for drive in found.values():
+    for drive in drive_of_size.values():
         measured += rows.solver_rows(drive, is_full)
-    measured += rows.opencv_rows(found)
+    measured += rows.opencv_rows(drive_of_size)
     measured += rows.engine_rows(MESSAGES)
     measured += rows.bag_rows(MESSAGES)
-    measured += processes.process_rows(found)
+    measured += processes.process_rows(drive_of_size)
     return source, measured, processes.memory(sizes[4:])
 
 
 def versions():
-    """What the times depend on."""
-    found = [f"python {platform.python_version()}", f"cores {os.cpu_count()}"]
+    """Return the versions of Python and packages, and the number of cores."""
+    texts = [f"python {platform.python_version()}", f"cores {os.cpu_count()}"]
     for name in (
         "numpy",
         "scipy",
@@ -65,14 +67,14 @@ def versions():
         "opencv-python-headless",
     ):
         try:
-            found.append(f"{name} {version(name)}")
+            texts.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    return ", ".join(found)
+    return ", ".join(texts)
 
 
 def main(arguments=None):
-    """Run everything; exit code."""
+    """Run all benchmarks, and return the exit code."""
     parser = argparse.ArgumentParser(
         description="Benchmarks of hand_eye_calib against the checked-in baseline."
     )
@@ -100,25 +102,27 @@ def main(arguments=None):
     tables = table.tables(source, measured, memory)
     table.show(tables)
     if options.page:
-        typed = " ".join(
+        command = " ".join(
             ["python benchmarks/run.py", *(arguments or sys.argv[1:])]
         )
-        note = f"Measured by `OMP_NUM_THREADS=1 {typed}` with {versions()}.\n"
+        note = f"Measured by `OMP_NUM_THREADS=1 {command}` with {versions()}.\n"
         table.write(tables, options.page, note)
-    known = json.loads(BASELINE.read_text(encoding="utf-8"))
+    stored = json.loads(BASELINE.read_text(encoding="utf-8"))
     ratios = baseline.ratios(measured, memory)
     if options.update:
-        known[source] = {
+        stored[source] = {
             name: float(f"{ratio:.2g}") for name, ratio in ratios.items()
         }
         BASELINE.write_text(
-            json.dumps(known, indent=2) + "\n", encoding="utf-8"
+            json.dumps(stored, indent=2) + "\n", encoding="utf-8"
         )
         return 0
-    found = baseline.failures(measured, ratios, known[source])
-    told = "\n".join(found) or f"all {len(measured)} rows within the baseline"
-    print(told, file=sys.stderr if found else sys.stdout)
-    return 1 if found else 0
+    failures = baseline.failures(measured, ratios, stored[source])
+    if failures:
+        print("\n".join(failures), file=sys.stderr)
+        return 1
+    print(f"all {len(measured)} rows within the baseline")
+    return 0
 
 
 if __name__ == "__main__":

@@ -45,12 +45,12 @@ N_COLOURS = 128
 # Number of letters by which sentences are recognised as the same.
 SAME_START = 25
 
-# Headlines of the start and the end that explain nothing.
+# Headlines of the start and the end, which are not part of the picture.
 LEFT_OUT = ("NO NODE", "CHECK INPUT", "ENDED")
 
 
 class Player(http.server.BaseHTTPRequestHandler):
-    """Serves the page, and sends ``server.html`` whenever it changes."""
+    """Serve the page, and send ``server.html`` whenever it changes."""
 
     protocol_version = "HTTP/1.1"
 
@@ -82,7 +82,7 @@ class Player(http.server.BaseHTTPRequestHandler):
 
 
 def chosen_pages(file):
-    """Return the last page of each sentence of a session, in order; its numbers may differ."""
+    """Return the last page of each series of pages whose headlines differ only at their ends."""
     rows = [json.loads(line) for line in file.read_text().splitlines()]
     pages = [Page(html) for _, html in rows]
     pages = [page for page in pages if page.word not in LEFT_OUT]
@@ -94,9 +94,8 @@ def photographs(pages, width):
     """Yield a picture of each page."""
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Player)
     server.html = ""
-    server.handle_error = lambda *_: (
-        None
-    )  # the browser closes connections at any time
+    # The browser may close a connection at any time, which is no error.
+    server.handle_error = lambda *_: None
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(folder)
@@ -110,8 +109,9 @@ def photographs(pages, width):
         browser.call("Emulation.setDeviceMetricsOverride", **size)
         for page in pages:
             server.html = page.html
-            headline = json.dumps(page.headline.partition(": ")[2][:40])
-            browser.wait_for(f"document.body.innerText.includes({headline})")
+            _, _, sentence = page.headline.partition(": ")
+            start = json.dumps(sentence[:40])
+            browser.wait_for(f"document.body.innerText.includes({start})")
             data = browser.call("Page.captureScreenshot", format="png")["data"]
             yield Image.open(io.BytesIO(base64.b64decode(data)))
         server.html = None

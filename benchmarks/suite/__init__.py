@@ -1,1 +1,1 @@
-"""What ``benchmarks/run.py`` measures, compares and shows."""
+"""Parts of ``benchmarks/run.py``: measurements, comparison with the baseline, tables."""

@@ -1,5 +1,5 @@
-"""Drives to measure with: the two KITTI drives of Valimaki et al. 2023 where they are there, and
-simulated ones of any length.
+"""Drives for the benchmarks: the two KITTI drives of Valimaki et al. 2023 if their files are
+present, and simulated drives of any length.
 """
 
 import os
@@ -15,37 +15,41 @@ from hand_eye_calib.core.pairing.motion_pairs import PosePairs, motion_pairs
 from reproduction.published import load_kitti_long, load_kitti_short
 
 REFERENCE = "B5"
-# Pairs with B5; the KITTI drives have 448 and 2,343 poses in common.
+# Numbers of motion pairs of reference B5 in the KITTI drives, which have 448 and 2,343 common
+# poses.
 SHORT = 443
 LONG = 2338
-# Messages of both streams together.
+# Number of messages of both streams together.
 MESSAGES = 40_000
 STREAMS = ("parent", "child")
 START_NS = 1_700_000_000_000_000_000
 T_PARENT_CHILD = se3.exp(np.array([0.3, -0.1, 0.2, 0.3, -0.5, 1.2]))
 
+# Number of poses that are simulated at a time, to save memory.
 _POSES_AT_A_TIME = 100_000
+# Interval of the poses of a drive (ns).
 _PERIOD_NS = 100_000_000
-_SIGMA = np.repeat([0.01, 0.002], 3)  # m, rad
-# Of the poses of messages: B5 at 400 Hz spans 12 ms, with a centimetre there would be nothing to
-# solve.
-_SIGMA_OF_MESSAGES = np.repeat([2e-5, 5e-6], 3)  # m, rad
+# Noise of the poses of a drive (m, rad).
+_SIGMA = np.repeat([0.01, 0.002], 3)
+# Noise of the poses of messages (m, rad). The motion of a pair of B5 at 400 Hz lasts 12 ms, and is
+# so small that a centimetre of noise would hide it.
+_SIGMA_OF_MESSAGES = np.repeat([2e-5, 5e-6], 3)
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Synchronised poses, their motion pairs and the true answer."""
+    """Synchronised poses, their motion pairs and the true extrinsic."""
 
     poses: PosePairs
     T_parent_child: np.ndarray
 
     @property
     def pairs(self):
-        """MotionPairs of reference B5."""
+        """Motion pairs of reference B5."""
         return motion_pairs(self.poses.Ts_pw_p, self.poses.Ts_cw_c, REFERENCE)
 
     def trajectories(self):
-        """Parent and child as Trajectory."""
+        """Return the trajectories of parent and child."""
         stamps_ns = self.poses.stamps_ns
         return Trajectory(stamps_ns, self.poses.Ts_pw_p), Trajectory(
             stamps_ns, self.poses.Ts_cw_c
@@ -53,8 +57,8 @@ class Drive:
 
 
 def drives(sizes):
-    """Source of the two drives of published lengths, and a Drive for every number of pairs."""
-    found = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
+    """Return the source of the short and long drive, and a Drive by number of pairs."""
+    drive_of_size = {n_pairs: simulated_drive(n_pairs + 5) for n_pairs in sizes}
     shared = Path(__file__).resolve().parents[3] / "shared" / "data"
     folder = (
         Path(os.environ.get("HAND_EYE_CALIB_DATA", shared)) / "valimaki2023"
@@ -62,18 +66,19 @@ def drives(sizes):
     try:
         cases = {SHORT: load_kitti_short(folder), LONG: load_kitti_long(folder)}
     except InputError:
-        return "simulated", found
+        return "simulated", drive_of_size
     for size, case in cases.items():
         poses = PosePairs(
             case.parent.stamps_ns, case.parent.poses, case.child.poses
         )
-        found[size] = Drive(poses, case.T_parent_child)
-    return "published", found
+        drive_of_size[size] = Drive(poses, case.T_parent_child)
+    return "published", drive_of_size
 
 
 def messages(first, count, rate_hz):
-    """Trajectories of both sensors, of poses number ``first`` to ``first + count`` of a smooth
-    motion about all axes, with noise.
+    """Return trajectories of both sensors with noise, in a smooth motion about all axes.
+
+    They contain the poses with numbers from ``first`` to ``first + count``.
     """
     numbers = first + np.arange(count)
     s = numbers / rate_hz
@@ -109,9 +114,7 @@ def messages(first, count, rate_hz):
 
 
 def parts(first, count, rate_hz):
-    """Stamps, positions and quaternions of both streams as lists, as messages have them, a dict by
-    stream.
-    """
+    """Return the fields of messages by stream: lists of stamps (ns), positions and quaternions."""
     return {
         stream: (
             trajectory.stamps_ns.tolist(),
@@ -125,8 +128,9 @@ def parts(first, count, rate_hz):
 
 
 def simulated_drive(n_poses, seed=0):
-    """A road vehicle's smooth motion with noise on both sensors, and a jump of the child every
-    fifty poses or so.
+    """Simulate a road vehicle's smooth motion with noise on both sensors.
+
+    The child jumps at 2 % of the poses.
     """
     stamps_ns = _PERIOD_NS * np.arange(n_poses)
     Ts_pw_p, Ts_cw_c = np.empty((2, n_poses, 4, 4))

@@ -1,27 +1,30 @@
-"""One measurement: processor time, repeated until the median holds still."""
+"""Measure the processor time of a function, as the median of several repeats."""
 
 import time
 from dataclasses import dataclass
 
 import numpy as np
 
-# Seconds for one row, the shortest time that is told apart, and repeats at least and at most.
+# Time for the repeats of a row (s).
 _BUDGET_S = 1.0
+# Shortest time that is measured precisely (s); faster functions are called several times in it.
 _SHORTEST_S = 2e-3
+# Limits of the number of repeats.
 _FEWEST = 2
 _MOST = 25
+# Fewest repeats of the slow function of a ratio.
 _FEWEST_TURNS = 3
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement.
+    """A measured time.
 
     Attributes
     ----------
     name : str
     size : int
-        Motion pairs, poses or messages.
+        Number of motion pairs, poses or messages.
     seconds : float
         Median of the repeats.
     spread : float
@@ -29,7 +32,7 @@ class Row:
     repeats : int
     objective : float, optional
     error_m, error_rad : float, optional
-        Of the answer, against the truth.
+        Errors of the extrinsic, against the truth.
     """
 
     name: str
@@ -48,8 +51,9 @@ class Row:
 
 
 def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
-    """Row for ``work()``, and what the last call returned. The first call does not count unless it
-    alone takes up the budget.
+    """Measure ``work()``; return its row and the result of the last call.
+
+    The first call does not count, unless it alone exceeds ``budget_s``.
     """
     start = clock()
     result = work()
@@ -66,10 +70,11 @@ def measure(name, size, work, budget_s=_BUDGET_S, clock=time.process_time):
 
 
 def measure_in_turn(size, slow, fast, clock=time.process_time):
-    """Rows for two named pieces of work, (name, work) each, and what they returned.
+    """Measure two functions alternately; return (row, result) for each.
 
-    A processor's speed changes within seconds: for the ratio to hold, every call of the slow one is
-    followed by as many of the fast one as take a tenth of its time.
+    ``slow`` and ``fast`` are pairs (name, function). A processor's speed changes within seconds,
+    and would change the ratio of the times. Therefore, calls of the fast function follow each call
+    of the slow function, for a tenth of its time.
     """
 
     def timed(work):
@@ -79,7 +84,8 @@ def measure_in_turn(size, slow, fast, clock=time.process_time):
 
     slow_s = []
     fast_s = []
-    _, of_fast = timed(fast[1])  # does not count: it warms up
+    # The first call fills caches, and does not count.
+    _, of_fast = timed(fast[1])
     while len(slow_s) < _FEWEST_TURNS or sum(slow_s) < _BUDGET_S:
         seconds, of_slow = timed(slow[1])
         slow_s.append(seconds)
@@ -93,7 +99,7 @@ def measure_in_turn(size, slow, fast, clock=time.process_time):
 
 
 def row_of(name, size, times):
-    """Row for times that have been taken elsewhere, in seconds."""
+    """Return the row of times (s) that were measured elsewhere."""
     median = float(np.median(times))
     return Row(
         name,

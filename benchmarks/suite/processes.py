@@ -1,4 +1,4 @@
-"""Rows measured as whole processes: from files to the result, start of the command line, memory."""
+"""Rows of whole processes: from files to the result, start of the command line, memory."""
 
 import compileall
 import os
@@ -18,15 +18,15 @@ PROJECT = Path(__file__).resolve().parents[2]
 _REPEATS = 5
 _TOPIC_OPTIONS = ("--parent-topic", "--child-topic")
 
-# Peak memory in bytes after importing everything, and after solving this many pairs; they are made
-# bit by bit, so that only they count.
+# Script that prints peak memory (bytes) before and after the solve of some pairs, and the size of
+# the pairs. The pairs are simulated in parts, so that the simulation needs little memory.
 _MEMORY = """
 import sys
 import numpy as np
 from suite.data import simulated_drive
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers.registry import Method
-def peak():  # the maximum that resource tells includes this process's parent
+def peak():  # the maximum of the module resource includes the parent process
     lines = open("/proc/self/status")
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
 size, part = int(sys.argv[1]), 10_000
@@ -43,12 +43,9 @@ print(before, peak(), A.nbytes + B.nbytes)
 
 
 def process_rows(drives):
-    """From two TUM files, and from a bag, to the result with covariance; the time until the command
-    line shows its help.
-    """
-    compileall.compile_dir(
-        PROJECT / "hand_eye_calib", quiet=1
-    )  # as pip installs it
+    """Yield rows for: two TUM files or a bag to the result with covariance, and the help texts."""
+    # An installation by pip contains compiled modules, too.
+    compileall.compile_dir(PROJECT / "hand_eye_calib", quiet=1)
     calibrate = [sys.executable, "-m", "hand_eye_calib", "calibrate"]
     with tempfile.TemporaryDirectory() as folder:
         files = [
@@ -60,11 +57,9 @@ def process_rows(drives):
             write_trajectory(file, trajectory)
         bag = Path(folder, "bag")
         write_messages(bag, MESSAGES)
-        sources = [
-            word
-            for pair in zip(_TOPIC_OPTIONS, TOPICS, strict=True)
-            for word in pair
-        ]
+        sources = []
+        for option, topic in zip(_TOPIC_OPTIONS, TOPICS, strict=True):
+            sources += [option, topic]
         commands = {
             (NUMPY, 0): [sys.executable, "-c", "import numpy"],
             ("calibrate --help", 0): [*calibrate, "--help"],
@@ -79,43 +74,45 @@ def process_rows(drives):
             ("bag to result", MESSAGES): [*calibrate, str(bag), *sources],
         }
         for (name, size), command in commands.items():
-            wall, processor = zip(
-                *(_run(command) for _ in range(_REPEATS)), strict=True
-            )
-            yield row_of(name, size, processor)
+            runs = [_run(command) for _ in range(_REPEATS)]
+            yield row_of(name, size, [processor_s for _, processor_s in runs])
             if name == "files to result":
-                yield row_of(f"{name}, wall", size, wall)
+                walls_s = [wall_s for wall_s, _ in runs]
+                yield row_of(f"{name}, wall", size, walls_s)
 
 
 def _run(command):
-    """Wall and processor time of a process, in seconds."""
-    with tempfile.TemporaryFile("w+") as said:
+    """Run a process; return its wall time and processor time (s)."""
+    with tempfile.TemporaryFile("w+") as errors:
         start = time.perf_counter()
         process = subprocess.Popen(
-            command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=said
+            command, cwd=PROJECT, stdout=subprocess.DEVNULL, stderr=errors
         )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
-        wall = time.perf_counter() - start
-        if process.returncode not in (0, 3):  # 3: an axis is not observable
-            said.seek(0)
+        wall_s = time.perf_counter() - start
+        # 3 is the exit code if an axis is not observable.
+        if process.returncode not in (0, 3):
+            errors.seek(0)
             raise RuntimeError(
-                f"{command} ended with {process.returncode}: {said.read()}"
+                f"{command} ended with {process.returncode}: {errors.read()}"
             )
-    return wall, usage.ru_utime + usage.ru_stime
+    return wall_s, usage.ru_utime + usage.ru_stime
 
 
 def memory(sizes):
-    """For each number of pairs: peak memory of a process that solves them by DNLO, before and
-    after, and what the pairs take, in bytes.
+    """Return the memory (bytes) of a process that solves pairs by DNLO, by number of pairs.
+
+    Each value contains the peak before the solve, the peak after it, and the size of the pairs.
     """
     path = os.pathsep.join([str(PROJECT / "benchmarks"), str(PROJECT)])
-    found = {}
+    memory_of_size = {}
     for size in sizes:
         command = [sys.executable, "-c", _MEMORY, str(size)]
         options = dict(capture_output=True, text=True, check=True)
         done = subprocess.run(
             command, **options, env=os.environ | {"PYTHONPATH": path}
         )
-        found[size] = tuple(map(int, done.stdout.split()))
-    return found
+        numbers = [int(word) for word in done.stdout.split()]
+        memory_of_size[size] = tuple(numbers)
+    return memory_of_size

@@ -1,4 +1,4 @@
-"""Rows measured within this process: from synchronised poses to the answer, the engine, bags."""
+"""Rows measured in this process: solvers on synchronised poses, the engine, and bags."""
 
 import functools
 import sys
@@ -26,32 +26,33 @@ from suite.baseline import FLOOR, OPENCV
 from suite.data import LONG, REFERENCE, SHORT, messages, parts
 from suite.measuring import measure, measure_in_turn, row_of
 
-# Up to these sizes a row is part of every run, and of a full one.
+# Largest numbers of pairs of some rows in a usual run.
 _USUAL = {"other methods": 10_000, "adaptive": 10_000}
+# The same in a run with ``--full``.
 _FULL = {"other methods": 100_000, "adaptive": 100_000}
+# Largest number of pairs of the row "jackknife and covariance".
 _JACKKNIFE = 100_000
 OPENCV_METHODS = ("PARK", "TSAI", "HORAUD", "ANDREFF", "DANIILIDIS")
 TOPICS = ("/lidar/odometry", "/camera/odometry")
 
 
 def solver_rows(drive, is_full):
-    """Rows of everything between synchronised poses and the answer, for one drive."""
+    """Yield the rows of all steps from synchronised poses to the extrinsic, for a drive."""
     poses = drive.poses
     pairs = drive.pairs
     size = len(pairs)
     most = _FULL if is_full else _USUAL
 
-    def row(name, work, answer=None):
-        measured, result = measure(name, size, work)
-        return (
-            measured
-            if answer is None
-            else judged(
-                measured, answer(result), getattr(result, "objective", None)
-            )
-        )
+    def row(name, work):
+        measured, _ = measure(name, size, work)
+        return measured
 
-    def judged(measured, T_parent_child, objective):
+    def row_with_errors(name, work):
+        measured, result = measure(name, size, work)
+        objective = getattr(result, "objective", None)
+        return with_errors(measured, result.T_parent_child, objective)
+
+    def with_errors(measured, T_parent_child, objective):
         metres, radians = absolute_errors(T_parent_child, drive.T_parent_child)
         return replace(
             measured, objective=objective, error_m=metres, error_rad=radians
@@ -59,9 +60,6 @@ def solver_rows(drive, is_full):
 
     def solved(method, backend="fast"):
         return lambda: Method(method, backend=backend).solve(pairs)
-
-    def extrinsic(result):
-        return result.T_parent_child
 
     yield row(
         FLOOR,
@@ -76,14 +74,14 @@ def solver_rows(drive, is_full):
         if size in (SHORT, LONG):
             slow = (f"{method} ipopt", solved(method, "ipopt"))
             for measured, solution in measure_in_turn(size, slow, fast):
-                yield judged(
+                yield with_errors(
                     measured, solution.T_parent_child, solution.objective
                 )
         else:
-            yield row(*fast, extrinsic)
+            yield row_with_errors(*fast)
     if size <= most["other methods"]:
         for method in ("park", "taylor", "zhuang", "ali"):
-            yield row(method, solved(method), extrinsic)
+            yield row_with_errors(method, solved(method))
     if size <= _JACKKNIFE:
         method = Method("dnlo")
         solution = solved("dnlo")()
@@ -98,12 +96,11 @@ def solver_rows(drive, is_full):
             ),
         )
     if size <= most["adaptive"]:
-        yield row(
+        yield row_with_errors(
             "adaptive",
             lambda: estimator.solve(
                 poses.stamps_ns, poses.Ts_pw_p, poses.Ts_cw_c
             ),
-            extrinsic,
         )
         yield row(
             "reference auto", lambda: select_reference(poses, Method("dnlo"))
@@ -111,7 +108,7 @@ def solver_rows(drive, is_full):
 
 
 def opencv_rows(drives):
-    """OpenCV on the short drive, and on the long one with what was fastest there."""
+    """Yield rows of OpenCV: all methods on the short drive, and the fastest on the long drive."""
     try:
         import cv2
     except ImportError:
@@ -121,7 +118,7 @@ def opencv_rows(drives):
     methods = OPENCV_METHODS
     for size in (SHORT, LONG):
         poses = drives[size].poses
-        found = []
+        rows_of_drive = []
         for method in methods:
             row, T_parent_child = measure(
                 f"opencv {method.lower()}",
@@ -133,9 +130,11 @@ def opencv_rows(drives):
             metres, radians = absolute_errors(
                 T_parent_child, drives[size].T_parent_child
             )
-            found.append(replace(row, error_m=metres, error_rad=radians))
-        yield from found
-        quickest = min(found, key=lambda row: row.seconds)
+            rows_of_drive.append(
+                replace(row, error_m=metres, error_rad=radians)
+            )
+        yield from rows_of_drive
+        quickest = min(rows_of_drive, key=lambda row: row.seconds)
         yield replace(quickest, name=OPENCV)
         methods = [
             method
@@ -145,11 +144,11 @@ def opencv_rows(drives):
 
 
 def opencv(cv2, method, Ts_pw_p, Ts_cw_c):
-    """T_parent_child (4, 4) by OpenCV's ``calibrateHandEye``, what a user would run instead.
+    """Return T_parent_child (4, 4) from OpenCV's ``calibrateHandEye``.
 
-    Its "gripper to base" is our pose of the parent in its world, its "target to camera" the inverse
-    of our pose of the child in its: then its "camera to gripper" is T_parent_child. It makes a pair
-    of every two poses.
+    OpenCV's "gripper to base" is the pose of the parent in its world. OpenCV's "target to camera"
+    is the inverse of the pose of the child in its world. Then OpenCV's "camera to gripper" is
+    T_parent_child. OpenCV uses the motions between all pairs of poses.
     """
     Ts_child_world = se3.inverse(Ts_cw_c)
     rotation, translation = cv2.calibrateHandEye(
@@ -163,7 +162,7 @@ def opencv(cv2, method, Ts_pw_p, Ts_cw_c):
 
 
 def engine_rows(n_messages):
-    """Time per message of the engine: at the median, and at the 99th percentile."""
+    """Yield rows of the engine's time for a message: median and 99th percentile."""
     calibrator = Calibrator()
     times = []
     streams = parts(0, n_messages // 2, 100)
@@ -183,8 +182,9 @@ def engine_rows(n_messages):
 
 
 def bag_rows(n_messages):
-    """Of every storage two Odometry topics, read by us, and iterated over with every message
-    deserialised by rosbags.
+    """Yield rows for the reading of two Odometry topics, by rosbags alone and by this package.
+
+    rosbags alone only decodes all messages. Every kind of storage has its own rows.
     """
     for storage in ("mcap", "sqlite3", "rosbag1"):
         with tempfile.TemporaryDirectory() as folder:
@@ -205,7 +205,7 @@ def bag_rows(n_messages):
 
 
 def write_messages(path, n_messages, storage="mcap"):
-    """A bag of both streams on TOPICS."""
+    """Write a bag of both streams on TOPICS."""
     trajectories = messages(0, n_messages // 2, 100)
     streams = zip(trajectories, ["nav_msgs/msg/Odometry"] * 2, strict=True)
     write_bag(path, dict(zip(TOPICS, streams, strict=True)), storage)

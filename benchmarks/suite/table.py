@@ -1,4 +1,4 @@
-"""The tables, on the terminal and in the documentation."""
+"""Tables of the benchmarks, on the terminal and in the documentation."""
 
 import sys
 from typing import NamedTuple
@@ -25,65 +25,56 @@ class Table(NamedTuple):
 
 
 def tables(source, rows, memory):
-    """Everything that was measured, a list of Table."""
+    """Return the tables of all rows."""
     sizes = {row.size for row in rows if row.name == FLOOR}
     of_pairs = [row for row in rows if row.size in sizes]
-    found = [
-        _growth(
-            source,
-            [row for row in of_pairs if not row.name.startswith("opencv")],
-        )
+    without_opencv = [
+        row for row in of_pairs if not row.name.startswith("opencv")
     ]
+    all_tables = [_growth(source, without_opencv)]
     for size, name in ((SHORT, "short"), (LONG, "long")):
-        found.append(
-            _side_by_side(
-                f"All methods: {source} {name} drive, {size:,} pairs",
-                [row for row in of_pairs if row.size == size],
-            )
-        )
-    found.append(
-        _others([row for row in rows if row.size not in sizes], memory)
-    )
-    return [
-        *found,
-        Table("Aims", ["aim", "measured", "met"], aims(rows, memory)),
-    ]
+        title = f"All methods: {source} {name} drive, {size:,} pairs"
+        rows_of_drive = [row for row in of_pairs if row.size == size]
+        all_tables.append(_side_by_side(title, rows_of_drive))
+    others = [row for row in rows if row.size not in sizes]
+    all_tables.append(_others(others, memory))
+    headings = ["aim", "measured", "met"]
+    all_tables.append(Table("Aims", headings, aims(rows, memory)))
+    return all_tables
 
 
-def show(found):
+def show(all_tables):
     """Print tables."""
     console = Console(width=None if sys.stdout.isatty() else 150)
-    for each in found:
-        shown = table.Table(title=each.title, box=box.SIMPLE_HEAD)
-        for index, heading in enumerate(["", *each.headings]):
+    for text_table in all_tables:
+        shown = table.Table(title=text_table.title, box=box.SIMPLE_HEAD)
+        for index, heading in enumerate(["", *text_table.headings]):
             shown.add_column(heading, justify="right" if index else "left")
-        for row in each.rows:
+        for row in text_table.rows:
             shown.add_row(*row)
         console.print(shown)
 
 
-def write(found, page, note):
+def write(all_tables, page, note):
     """Replace the tables of an earlier run in a Markdown page, with a note before them."""
     before, _, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
     _, _, after = rest.partition(_END)
     parts = [_BEGIN, note]
-    for each in found:
+    for text_table in all_tables:
         lines = [
-            ["", *each.headings],
-            ["---", *["---:"] * len(each.headings)],
-            *each.rows,
+            ["", *text_table.headings],
+            ["---", *["---:"] * len(text_table.headings)],
+            *text_table.rows,
         ]
-        parts.append(
-            f"### {each.title}\n\n"
-            + "".join(f"| {' | '.join(line)} |\n" for line in lines)
-        )
+        texts = [f"| {' | '.join(line)} |\n" for line in lines]
+        parts.append(f"### {text_table.title}\n\n{''.join(texts)}")
     page.write_text(
         before + "\n".join([*parts, _END]) + after, encoding="utf-8"
     )
 
 
 def _readable(seconds):
-    """A time in three digits."""
+    """Return a time with three digits and a unit."""
     size, unit = next(
         (unit for unit in _UNITS if seconds >= unit[0]), _UNITS[-1]
     )
@@ -95,22 +86,25 @@ def _cell(row):
 
 
 def _growth(source, rows):
+    """Return the table of times by method and number of pairs."""
     sizes = sorted({row.size for row in rows})
-    cells = {}
+    time_of = {}
     for row in rows:
-        cells.setdefault(row.name, {})[row.size] = _readable(row.seconds)
+        time_of[row.name, row.size] = _readable(row.seconds)
+    lines = []
+    for name in dict.fromkeys(row.name for row in rows):
+        times = [time_of.get((name, size), "") for size in sizes]
+        lines.append([name, *times])
     return Table(
         f"Processor time by number of motion pairs ({REFERENCE}; {SHORT} and {LONG:,} "
         f"{source}, others simulated)",
         [f"{size:,}" for size in sizes],
-        [
-            [name, *(found.get(size, "") for size in sizes)]
-            for name, found in cells.items()
-        ],
+        lines,
     )
 
 
 def _side_by_side(title, rows):
+    """Return the table of all methods on a drive: time, objective and errors."""
     return Table(
         title,
         ["time", "objective", "e_at, m", "e_aR, deg"],
@@ -129,6 +123,7 @@ def _side_by_side(title, rows):
 
 
 def _others(rows, memory):
+    """Return the table of processes, bags, messages and memory."""
     lines = [
         [row.name, f"{row.size:,}" if row.size else "", _cell(row)]
         for row in rows
