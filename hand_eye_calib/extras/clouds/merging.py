@@ -317,8 +317,9 @@ def _axis_of_surfaces(
 
     It is the principal axis nearest to the direction. Without planes, it is any axis of the world.
     """
-    every = -(-len(surfaces) // TUNING.max_points)
-    _, normals = _planes(surfaces, surfaces[::every])
+    # At most ``max_points`` points have a normal.
+    stride = -(-len(surfaces) // TUNING.max_points)
+    _, normals = _planes(surfaces, surfaces[::stride])
     normals = normals[np.isfinite(normals).all(axis=1)]
     _, axes = np.linalg.eigh(normals.T @ normals)
     cosines = axes.T @ direction

@@ -49,7 +49,7 @@ _CAPTION = (
     "with its standard deviation, which includes the usual scatter between recordings. "
     "The band is three standard deviations of the common value, "
     "without the allowance for constant errors, which all recordings share. "
-    "Squares do not belong to the others."
+    "Squares are recordings that contradict the others."
 )
 
 

@@ -53,9 +53,20 @@ _Recordings: TypeAlias = Iterable[_Pair] | Mapping[str, _Pair]
 
 # Fields of a result in its row of the table.
 _FIELDS_OF_ROW = (
-    *("verdict", "headline", "status", "parent_frame", "child_frame"),
-    *("method", "reference", "n_poses", "n_pairs", "n_inliers"),
-    *("time_offset_s", "time_offset_sigma_s", "scale", "scale_sigma"),
+    "verdict",
+    "headline",
+    "status",
+    "parent_frame",
+    "child_frame",
+    "method",
+    "reference",
+    "n_poses",
+    "n_pairs",
+    "n_inliers",
+    "time_offset_s",
+    "time_offset_sigma_s",
+    "scale",
+    "scale_sigma",
 )
 
 # Fields of the common result that are sums over the recordings.
@@ -63,22 +74,18 @@ _COUNTS = ("n_poses", "n_pairs", "n_inliers")
 
 # Fields of the common result that are taken from the newest recording.
 _OF_NEWEST = (
-    *(
-        "reference",
-        "backend",
-        "measured",
-        "exact_streams",
-        "stamp_ns",
-        "parent_frame",
-        "child_frame",
-    ),
-    *(
-        "base_frame",
-        "T_base_parent",
-        "target_translation",
-        "target_rotation",
-        "target_axes",
-    ),
+    "reference",
+    "backend",
+    "measured",
+    "exact_streams",
+    "stamp_ns",
+    "parent_frame",
+    "child_frame",
+    "base_frame",
+    "T_base_parent",
+    "target_translation",
+    "target_rotation",
+    "target_axes",
 )
 
 

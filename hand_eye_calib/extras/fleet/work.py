@@ -36,9 +36,9 @@ from hand_eye_calib.offline.cli.bags import read_recording
 from hand_eye_calib.offline.cli.options import STREAMS
 from hand_eye_calib.offline.cli.present import exit_code
 
-# Names in the directory of a batch: the outcome of a task in its folder, the table, the page, and
-# the folder of the vehicles.
+# File with the outcome of a task, in the folder of the task.
 STATE = "batch.jsonl"
+# Table, page and folder of the vehicles, in the directory of a batch.
 TABLE = "rows.csv"
 INDEX = "index.html"
 VEHICLES = "vehicles"
@@ -153,7 +153,7 @@ def _vehicle_of(bag: str, vehicle: str) -> str:
 def _full_path(bag: str) -> Path:
     """Return the path of a bag, or a URL without its query.
 
-    Resolve the path, because a path such as "." has no name.
+    The path is absolute, because a path such as "." contains no name.
     """
     if remote.is_url(bag):
         return Path(bag.partition("?")[0])

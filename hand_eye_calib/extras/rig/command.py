@@ -63,14 +63,13 @@ def calibrate_rig(
     rig = rig.with_warnings(restore_urls(readings.warnings))
     if arguments.out:
         kept = keep_earlier_results(arguments.out)
-        note(
-            f"wrote {save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)}{kept}"
-        )
+        file = save_rig(rig.to_dict(), rig.calibrations, arguments.out, inputs)
+        note(f"wrote {file}{kept}")
     document = rig.to_dict() | {"inputs": inputs} if arguments.json else None
     try:
         print_result(as_lines(rig, arguments.verbose), document)
     finally:
-        # Write the report even if printing fails, because the reader of the output has ended.
+        # The report is written even if printing fails, for example after the end of a pager.
         if arguments.out:
             from hand_eye_calib.extras.rig.page import write_rig_report
 
@@ -85,9 +84,9 @@ def _completed(
     snapshots: "dict[str, Snapshot]",
     snapshot: "Snapshot",
 ) -> "Snapshot":
-    """Return the snapshot of two sensors with the measurements in addition to motion of a bag.
+    """Add the measurements of a bag that need no motion to the snapshot of two sensors.
 
-    It is stored in ``snapshots`` by the frame of the child.
+    Returns the snapshot, and stores it in ``snapshots`` by the frame of the child.
     """
     if not arguments.topics:
         return snapshot

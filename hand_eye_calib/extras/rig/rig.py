@@ -147,8 +147,8 @@ def _with_copies(
 ) -> list[Calibration]:
     """Return the results with a finding in both results of two sensors that are copies.
 
-    The calibration with the first sensor has checked that sensor already. Each result alone agrees
-    with the first sensor, so that only two other sensors reveal a copy.
+    Copies of the first sensor already have a finding, from the calibration with the first sensor.
+    Here, the other sensors are compared with each other.
 
     Parameters
     ----------
@@ -170,14 +170,13 @@ def _with_copies(
             StreamPair(aligned[i], aligned[k], config.max_gap),
             are_exact=config.child_kind == "exact",
         )
-        for found in copied:
+        for of_pair in copied:
             names = {
                 "first": star[i].child_frame,
                 "second": star[k].child_frame,
             }
-            named = replace(
-                found, key="copied_in_rig", values={**found.values, **names}
-            )
+            values = {**of_pair.values, **names}
+            named = replace(of_pair, key="copied_in_rig", values=values)
             for number in (i, k):
                 findings = gravest_first([named, *results[number].findings])
                 results[number] = replace(results[number], findings=findings)
@@ -339,7 +338,7 @@ def advice_for_pair(calibration: Calibration) -> str:
 
 
 def _is_of_one_pair(option: str) -> bool:
-    """Return whether only two sensors have an option, a rig not."""
+    """Return whether an option exists for two sensors only, and not for a rig."""
     return option.startswith(_OF_ONE_PAIR) and option not in KINDS
 
 
@@ -424,17 +423,15 @@ class RigCalibration:
     @property
     def headline(self) -> str:
         """The verdict; if the sensors differ, each verdict with its sensors, the gravest first."""
-        of_verdict: dict[Verdict, list[str]] = {
-            verdict: [] for verdict in Verdict
-        }
-        for result in self.calibrations:
-            of_verdict[result.verdict].append(result.child_frame)
-        groups = [
-            (verdict, of_verdict[verdict]) for verdict in reversed(Verdict)
-        ]
-        texts = [
-            f"{verdict.value}: {listing(of)}" for verdict, of in groups if of
-        ]
+        texts = []
+        for verdict in reversed(Verdict):
+            frames = [
+                result.child_frame
+                for result in self.calibrations
+                if result.verdict is verdict
+            ]
+            if frames:
+                texts.append(f"{verdict.value}: {listing(frames)}")
         if len(texts) == 1:
             return f"{self.verdict.value}: {len(self.sensors)} sensors"
         return (

@@ -50,7 +50,7 @@ class Camera:
     def of(
         cls, where: object, matrix: Any, distortion: Any, model: str = ""
     ) -> Self:
-        """Return the camera of 9 numbers of its matrix, coefficients and the name of their model.
+        """Return a camera from the 9 numbers of its matrix, its distortion, and the model's name.
 
         Raises
         ------
@@ -135,7 +135,7 @@ def _entries(matrix: Any) -> Any:
 def camera_of(info: Any, is_rectified: bool, where: str) -> Camera:
     """Return the intrinsics of a CameraInfo message.
 
-    Rectified images have the intrinsics of its projection matrix P, without distortion.
+    For rectified images, they are those of the message's projection matrix P, without distortion.
     """
     is_ros1 = hasattr(info, "K")
     if is_rectified:

@@ -1,4 +1,4 @@
-"""Draw the corners of a target on its images: detected, and where the result puts them."""
+"""Draw the corners of a target on its images: as detected, and as predicted by the result."""
 
 import base64
 import html
@@ -51,7 +51,7 @@ class Reprojection(NamedTuple):
 def reprojections(
     calibration: Calibration, detections: TargetPoses, camera: Camera
 ) -> list[Reprojection]:
-    """Return the corners at each stop, detected and through the result.
+    """Return the detected and the predicted corners at each stop.
 
     The list is empty if the result does not use the detected poses as they are.
     """
@@ -59,7 +59,7 @@ def reprojections(
     if residuals is None or len(residuals) != len(detections.images):
         return []
     Ts = detections.Ts_camera_target.copy()
-    # The fit has the child's lengths in metres.
+    # The fit uses metres, but the target's lengths may be in another unit.
     Ts[:, :3, 3] *= calibration.scale
     Ts_target_camera = se3.inverse(Ts)
     positions = [stop.position_m for stop in calibration.parts["stops"].rows]
@@ -77,15 +77,15 @@ def reprojections(
     predicted = Ts_target_camera @ errors @ se3.inverse(T_method) @ X
     Ts_camera_target = se3.inverse(predicted)
     Ts_camera_target[:, :3, 3] /= calibration.scale
-    found = []
+    stops = []
     for T, corners, pixels in zip(
         Ts_camera_target, detections.corners, detections.pixels, strict=True
     ):
         projected = _projected(camera, T, corners)
         distances = np.linalg.norm(projected - pixels, axis=1)
         rms_px = float(np.sqrt(np.mean(distances**2)))
-        found.append(Reprojection(pixels, projected, rms_px))
-    return found
+        stops.append(Reprojection(pixels, projected, rms_px))
+    return stops
 
 
 def _projected(

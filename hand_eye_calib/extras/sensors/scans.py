@@ -108,9 +108,9 @@ class Scan(NamedTuple):
     rings : (N,) int array
         Elevations in half degrees from straight down.
     times_s : (N,) array
-        Since the middle of the scan.
+        Times since the middle of the scan.
     stamp_ns : int
-        Of the middle of the scan.
+        Stamp of the middle of the scan.
     frame : str
     """
 

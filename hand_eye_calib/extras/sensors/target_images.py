@@ -296,9 +296,19 @@ class TargetPoses:
 
 
 class _Pose(NamedTuple):
-    """Pose of the target, residual of its corners (rms, pixels), standard deviations (m, rad).
+    """Pose of the target in an image.
 
-    Its corners (n, 3), m, and their pixels (n, 2) follow.
+    Attributes
+    ----------
+    T_camera_target : (4, 4) array
+    rms_px : float
+        Residual of the corners (root mean square, pixels).
+    sigmas : (2,) array
+        Standard deviations of the pose (m, rad).
+    corners : (n, 3) array
+        Places of the detected corners in the frame of the target, m.
+    pixels : (n, 2) array
+        Pixels of these corners.
     """
 
     T_camera_target: FloatArray
@@ -314,11 +324,11 @@ class _Detector(NamedTuple):
     Attributes
     ----------
     detect : callable
-        Return pixels of corners and numbers of markers or corners in a grey image, both None if
-        there are none.
+        ``detect(image)`` returns pixels of corners, and numbers of markers or corners. Both are
+        None if there are no corners in the grey image.
     corners : (n, k, 3) array
-        Places of the corners by these numbers, m. The first is that of ``Target.number``. k is 4
-        for tags and markers, and 1 for inner corners of boards.
+        Places of the corners, m, by the number of their marker or corner. The first row belongs to
+        ``Target.number``. k is 4 for tags and markers, and 1 for inner corners of boards.
     """
 
     detect: Callable[[Any], Any]

@@ -19,7 +19,7 @@ _TOPICS = ["vehicle_odometry", "vehicle_local_position", "vehicle_attitude"]
 def logged_poses(data: bytes) -> tuple[IntArray, FloatArray]:
     """Return stamps (N,), us, and poses (N, 4, 4) of a log.
 
-    The axes are forward, right, down, in north, east, down.
+    The axes of the vehicle are forward, right, down. Those of its world are north, east, down.
 
     Raises
     ------
