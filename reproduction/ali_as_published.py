@@ -75,7 +75,7 @@ def solve(pairs: MotionPairs) -> Solution:
     quat_xyzw = np.roll(parameters[:4], -1)
     rotation = Rotation.from_quat(quat_xyzw).as_matrix()
     T_parent_child = se3.from_rotation_translation(rotation, parameters[4:])
-    translation_residuals, _ = pairs.residuals(T_parent_child)
+    translation_residuals = pairs.translation_residuals(T_parent_child)
     objective = float(np.sum(translation_residuals**2))
     return Solution(T_parent_child, objective, converged, np.ones(len(pairs)))
 

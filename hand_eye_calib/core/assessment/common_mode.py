@@ -119,7 +119,7 @@ def floor_of_pairs(
     rotation = se3.rotation_of(T_parent_child)
     by_xi, of_rotation = derivatives(pairs, rotation)
     by_log_scale = se3.translation_of(pairs.Ts_childi_childj) @ rotation.T
-    residual_t, _ = pairs.residuals(T_parent_child)
+    residual_t = pairs.translation_residuals(T_parent_child)
     columns = np.concatenate(
         [by_xi, by_log_scale[:, :, None], residual_t[:, :, None]], axis=2
     )

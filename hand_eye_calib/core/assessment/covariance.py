@@ -472,7 +472,8 @@ def model_covariance(
     )
     covariance = inverse @ score_covariance @ inverse
 
-    products = lever_arm_products(jacobian_t[..., :3], weights)
+    # The derivatives with respect to rho are the chords of lever arms.
+    products = information_t[:3, :3] / max(float(weights.sum()), 1.0)
     hidden = _hidden_directions(products, cov_r).T
     unseen = vectors[:, ~is_seen].T
     return covariance, basis([*_translations(hidden), *unseen])

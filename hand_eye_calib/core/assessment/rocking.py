@@ -67,9 +67,7 @@ def rocking_axis(pose_pairs: PosePairs) -> FloatArray | None:
         return None
     # Noise increases the tilt, and decreases the share that acceleration explains. Therefore the
     # less noisy stream decides.
-    parent_tilt_rad = _largest_tilt(se3.rotation_of(Ts_pw_p))
-    child_tilt_rad = _largest_tilt(se3.rotation_of(Ts_cw_c))
-    if min(parent_tilt_rad, child_tilt_rad) > _FLAT_RAD:
+    if _is_tilted(Ts_pw_p) and _is_tilted(Ts_cw_c):
         return None
     share = _explained(stamps_ns, Ts_pw_p, parent_axis)
     child_axis = _turning_axis(se3.rotation_of(Ts_cw_c))
@@ -103,15 +101,17 @@ def _turning_axis(rotations: FloatArray) -> FloatArray | None:
     return directions[:, 0] if is_single else None
 
 
-def _largest_tilt(rotations: FloatArray) -> float:
-    """Return the root mean square tilt (rad), at the baseline with the largest value."""
+def _is_tilted(Ts: FloatArray) -> bool:
+    """Return whether the tilt of poses (N, 4, 4) exceeds that on a flat road at a baseline."""
+    rotations = se3.rotation_of(Ts)
     longest = len(rotations) // 10
     baselines = np.geomspace(1, longest, _BASELINES).astype(int)
-    powers = []
-    for baseline in baselines.tolist():
-        eigenvalues = np.linalg.eigvalsh(_products(rotations, baseline))
-        powers.append(eigenvalues[0])
-    return float(np.sqrt(max(*powers, 0.0)))
+    # The tilt is usually largest at the longest baseline.
+    for baseline in baselines[::-1].tolist():
+        squared_tilts = np.linalg.eigvalsh(_products(rotations, baseline))
+        if squared_tilts[0] > _FLAT_RAD**2:
+            return True
+    return False
 
 
 def _explained(stamps_ns: IntArray, Ts: FloatArray, axis: FloatArray) -> float:

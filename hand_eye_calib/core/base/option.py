@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -257,11 +258,13 @@ class OptionSet:
 
     def __post_init__(self, _: object = None) -> None:
         for field in dataclasses.fields(self):
-            object.__setattr__(
-                self, field.name, check_value(field, getattr(self, field.name))
-            )
+            value = getattr(self, field.name)
+            # Defaults are valid. Configurations are copied often, with few other values.
+            if value is not field.default:
+                object.__setattr__(self, field.name, check_value(field, value))
 
     @classmethod
+    @functools.cache
     def by_name(cls) -> dict[str, OptionField]:
         """Return the fields of the options by their public names."""
         return {option_name(field): field for field in dataclasses.fields(cls)}

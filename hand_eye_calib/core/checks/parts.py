@@ -169,7 +169,7 @@ def _exchanged(motions: MotionPairs) -> MotionPairs:
 
 def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
     """Return the share (K,) of each displacement that an extrinsic X (4, 4) leaves unexplained."""
-    residuals_m, _ = motions.residuals(X)
+    residuals_m = motions.translation_residuals(X)
     lengths_m = np.linalg.norm(
         se3.translation_of(motions.Ts_parenti_parentj), axis=1
     )
@@ -271,6 +271,6 @@ def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
     """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     are_large = angles >= quantile(angles, 0.75)
-    _, residuals = motions.residuals(X)
+    residuals = motions.rotation_residuals(X)
     residual_lengths = np.linalg.norm(residuals[are_large], axis=1)
     return median(residual_lengths) / max(median(angles[are_large]), 1e-12)

@@ -268,14 +268,26 @@ class MotionPairs(Columns):
             Rotation vectors from ``R_A R`` to ``R R_B`` in rad, in the axes of the child sensor at
             instant j. Their lengths are the angles of eq. (7).
         """
+        return (
+            self.translation_residuals(T_parent_child),
+            self.rotation_residuals(T_parent_child),
+        )
+
+    def translation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
+        """Return the translations (K, 3) of :meth:`residuals`."""
         R = se3.rotation_of(T_parent_child)
         t = se3.translation_of(T_parent_child)
         R_A = se3.rotation_of(self.Ts_parenti_parentj)
         t_A = se3.translation_of(self.Ts_parenti_parentj)
-        R_B = se3.rotation_of(self.Ts_childi_childj)
         t_B = se3.translation_of(self.Ts_childi_childj)
-        translations = (R_A - np.eye(3)) @ t + t_A - t_B @ R.T
-        return translations, se3.rotations_between(R_A @ R, R @ R_B)
+        return (R_A - np.eye(3)) @ t + t_A - t_B @ R.T
+
+    def rotation_residuals(self, T_parent_child: FloatArray) -> FloatArray:
+        """Return the rotation vectors (K, 3) of :meth:`residuals`."""
+        R = se3.rotation_of(T_parent_child)
+        R_A = se3.rotation_of(self.Ts_parenti_parentj)
+        R_B = se3.rotation_of(self.Ts_childi_childj)
+        return se3.rotations_between(R_A @ R, R @ R_B)
 
 
 def motion_pairs(

@@ -70,7 +70,7 @@ def solve_park(pairs: MotionPairs) -> Solution:
         rows.reshape(-1, 3), targets.ravel(), rcond=RANK_TOLERANCE
     )
     T_parent_child = se3.from_rotation_translation(R, t)
-    objective = float((pairs.residuals(T_parent_child)[0] ** 2).sum())
+    objective = float((pairs.translation_residuals(T_parent_child) ** 2).sum())
     return Solution(T_parent_child, objective, True, np.ones(len(pairs)))
 
 
@@ -135,7 +135,7 @@ def solve_ali(pairs: MotionPairs) -> Solution:
     """Minimise ``sum |R_A t + t_A - R t_B - t|^2`` over X, for K >= 1 pairs."""
     rows = residual_rows(pairs)
     T, converged = _lowest_minimum(rows.T @ rows, pairs)
-    objective = float((pairs.residuals(T)[0] ** 2).sum())
+    objective = float((pairs.translation_residuals(T) ** 2).sum())
     return Solution(T, objective, converged, np.ones(len(pairs)))
 
 

@@ -34,7 +34,7 @@ import numpy as np
 from hand_eye_calib.core.assessment import moved
 from hand_eye_calib.core.assessment.common_mode import usual_speed
 from hand_eye_calib.core.base.arrays import FloatArray
-from hand_eye_calib.core.base.blocks import Blocks, information
+from hand_eye_calib.core.base.blocks import Blocks, information, solve
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.checks.agreement import slow_suspects
 from hand_eye_calib.core.checks.check import MAX_MOTIONS
@@ -288,13 +288,10 @@ def _differences_of_halves(blocks: Blocks, columns: list[int]) -> FloatArray:
     sums = blocks.merged(n_blocks).sums
     # Equal recordings always get equal splits.
     rng = np.random.default_rng(0)
-    differences = []
-    for _ in range(_N_TRIALS):
-        order = rng.permutation(n_blocks)
-        used = Blocks(sums[order[: n_blocks // 2]])
-        judging = Blocks(sums[order[n_blocks // 2 :]])
-        differences.append(judging.solve(columns) - used.solve(columns))
-    return np.array(differences)
+    orders = np.array([rng.permutation(n_blocks) for _ in range(_N_TRIALS)])
+    used = sums[orders[:, : n_blocks // 2]].sum(axis=1)
+    judging = sums[orders[:, n_blocks // 2 :]].sum(axis=1)
+    return solve(judging, columns) - solve(used, columns)
 
 
 def _first_shifts(blocks: Blocks, R: FloatArray) -> FloatArray:

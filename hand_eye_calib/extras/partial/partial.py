@@ -471,7 +471,7 @@ def _check_rotation(
     """Detect streams whose rotations differ too much under the estimated extrinsic."""
     span = min(_SPAN, max(len(Ts_pw_p) // 10, 1))
     pairs = motion_pairs(Ts_pw_p, Ts_cw_c, f"B{span}")
-    residuals = np.linalg.norm(pairs.residuals(T_parent_child)[1], axis=1)
+    residuals = np.linalg.norm(pairs.rotation_residuals(T_parent_child), axis=1)
     angles = se3.rotation_angle(se3.rotation_of(pairs.Ts_parenti_parentj))
     is_turning = angles >= np.quantile(angles, TURNING)
     usual_angle = float(np.median(angles[is_turning]))
