@@ -33,9 +33,9 @@ from hand_eye_calib.core.pairing.motion_pairs import (
 )
 from hand_eye_calib.core.results.records import ClockRate
 
-# Durations (s) of the motions from which the offset is estimated, with one fit per duration. The
-# fit with the smallest standard deviation is used, usually that of short motions.
-_LAGS_S = (1.0, 0.3, 3.0)
+#: Durations (s) of the motions from which the offset is estimated, with one fit per duration. The
+#: fit with the smallest standard deviation is used, usually that of short motions.
+LAGS_S = (1.0, 0.3, 3.0)
 
 # Largest number of motions in a fit that estimates a clock rate.
 _MAX_PAIRS_OF_RATE = 5 * MAX_PAIRS
@@ -171,6 +171,7 @@ def refine_time_offset(
     at: TimeOffset,
     max_gap_s: float,
     negligible_s: float = 0.0,
+    first: TimeOffset | None = None,
 ) -> TimeOffset:
     """Refine a clock offset by fits to motions of several durations.
 
@@ -184,6 +185,8 @@ def refine_time_offset(
     negligible_s : float
         Offset (s) that the caller can neglect. If a fit has a smaller offset, no further durations
         are tried.
+    first : TimeOffset, optional
+        Offset from motions of the first duration, if it is already estimated.
 
     Returns
     -------
@@ -198,8 +201,11 @@ def refine_time_offset(
     coarse_s = at.correlation.offset_s
     best = TimeOffset(coarse_s, reach_s / 5, at.correlation)
     offsets_s = list[float]()
-    for lag_s in _LAGS_S:
-        offset = offset_over(lag_s, parent, child, at, max_gap_s, negligible_s)
+    for lag_s in LAGS_S:
+        offset = first if lag_s == LAGS_S[0] else None
+        offset = offset or offset_over(
+            lag_s, parent, child, at, max_gap_s, negligible_s
+        )
         at = replace(at, fit=offset.fit)
         explains = offset.fit and offset.fit.explains_translation
         if not explains or abs(offset.seconds - coarse_s) > reach_s:
@@ -209,7 +215,7 @@ def refine_time_offset(
             best = offset
         if offset.largest_s(child.duration_s) < negligible_s:
             break
-    if len(offsets_s) < len(_LAGS_S):
+    if len(offsets_s) < len(LAGS_S):
         return best
     # The offsets differ if errors are correlated for longer than a block of the jackknife.
     sigma_s = float(np.hypot(best.sigma_s, np.std(offsets_s, ddof=1)))

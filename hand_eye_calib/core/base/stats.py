@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray
 
 # Median of the absolute value of a standard normal variable.
 MEDIAN_NORMAL = 0.6745
@@ -59,6 +59,15 @@ def medians(values: FloatArray) -> FloatArray:
     parted = np.partition(values, (half - 1, half), axis=-1)
     in_the_middle = parted[..., half - 1] + parted[..., half]
     return np.asarray(0.5 * in_the_middle)
+
+
+def masked_medians(values: FloatArray, is_used: BoolArray) -> FloatArray:
+    """Return the medians (...) of the values (..., K) inside a mask of the same shape."""
+    ascending = np.sort(np.where(is_used, values, np.inf), axis=-1)
+    counts = is_used.sum(axis=-1, keepdims=True)
+    below = np.take_along_axis(ascending, (counts - 1) // 2, axis=-1)
+    above = np.take_along_axis(ascending, counts // 2, axis=-1)
+    return np.asarray(0.5 * (below + above)[..., 0])
 
 
 def quantile(values: ArrayLike, share: float) -> float:

@@ -361,7 +361,7 @@ def _explain_by_extrinsic(
     """
     note_s = LIMITS["time_offset"].note
     error_s = LIMITS["time_offset"].error
-    lag_s = LAGS_S[1]
+    lag_s = time_offset.LAGS_S[0]
     offset = time_offset.offset_over(
         lag_s,
         streams.parent,

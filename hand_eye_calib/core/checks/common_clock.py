@@ -54,9 +54,10 @@ def fine_offset(
 ) -> TimeOffset:
     """Return the refined clock offset of corrected streams.
 
-    ``fit`` is used if the coarse offset has no fit of its own. If a coarse offset with a fit is
-    clearly below the smallest reported size, it is not refined. Slow streams cannot be
-    interpolated: their offset is accurate to one interval between poses.
+    A coarse offset with a fit is from motions of the first duration of time_offset.LAGS_S. It is
+    not refined if it is clearly below the smallest reported size. ``fit`` is used if the coarse
+    offset has no fit of its own. Slow streams cannot be interpolated: their offset is accurate to
+    one interval between poses.
     """
     note_s = LIMITS["time_offset"].note
     if (
@@ -76,6 +77,7 @@ def fine_offset(
         replace(coarse_offset, fit=coarse_offset.fit or fit),
         corrected.max_gap_s,
         note_s,
+        first=coarse_offset if coarse_offset.fit else None,
     )
 
 

@@ -16,6 +16,7 @@ corrects the parent by the child, or both streams by a third stream.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -94,18 +95,15 @@ class _Fit(NamedTuple):
     @property
     def is_turned(self) -> bool:
         """Whether the rotation of D is significant."""
-        is_large = (
-            self.rotation_rad > _LEAST_ROTATION_RAD and self.share > _SHARE
-        )
+        is_large = self.rotation_rad > _LEAST_ROTATION_RAD
         return is_large and self.rotation_sigmas > _SIGMAS
 
     @property
-    def is_shifted(self) -> bool:
-        """Whether the translation of D is significant."""
-        is_large = (
-            self.translation_m > _LEAST_TRANSLATION_M and self.share > _SHARE
-        )
-        return is_large and self.translation_sigmas > _SIGMAS
+    def is_significant(self) -> bool:
+        """Whether the rotation or the translation of D is significant."""
+        is_large = self.translation_m > _LEAST_TRANSLATION_M
+        is_shifted = is_large and self.translation_sigmas > _SIGMAS
+        return self.is_turned or is_shifted
 
     @property
     def is_certain(self) -> bool:
@@ -137,7 +135,7 @@ def check_correction(
         warning, which is used only if no other fault was found.
     """
     best = _best_fit(pose_pairs, T_parent_child)
-    if best is None or not (best.is_turned or best.is_shifted):
+    if best is None or not best.is_significant:
         return None
     return finding(
         "not_independent",
@@ -153,7 +151,10 @@ def check_correction(
 
 
 def _best_fit(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Fit | None:
-    """Return the fit of the filter that explains most, or None for too few motions."""
+    """Return the fit of the filter that explains most.
+
+    The result is None for too few motions, or if no filter explains enough.
+    """
     if len(pose_pairs) < MIN_PAIRS:
         return None
     differences = _Differences(pose_pairs, T_parent_child)
@@ -163,7 +164,7 @@ def _best_fit(pose_pairs: PosePairs, T_parent_child: FloatArray) -> _Fit | None:
         differences.regression(constant_s) for constant_s in _TIME_CONSTANTS_S
     )
     best = max(regressions, key=lambda regression: regression.share)
-    return differences.fit(best)
+    return differences.fit(best) if best.share > _SHARE else None
 
 
 class _Regression(NamedTuple):
@@ -315,11 +316,10 @@ class _Differences:
             self._residuals[:, :3], self._residuals[:, 3:]
         )
         self._of_parent = _Regressors(poses, T_parent_child, seconds, pairs)
-        self._of_child = _Regressors(
-            pose_pairs.Ts_cw_c, T_parent_child, seconds, pairs
-        )
         self._usual_errors = self._of_parent.usual_errors()
-        self._usual_instruments = self._of_child.usual_errors()
+        self._regressors_of_child = partial(
+            _Regressors, pose_pairs.Ts_cw_c, T_parent_child, seconds, pairs
+        )
 
     @property
     def n_motions(self) -> int:
@@ -347,8 +347,9 @@ class _Differences:
     def fit(self, regression: _Regression) -> _Fit:
         """Estimate the mount change D and its standard deviations with the instruments."""
         time_constant_s = regression.time_constant_s
+        of_child = self._regressors_of_child()
         instruments = self._joined(
-            self._usual_instruments, self._of_child.filtered(time_constant_s)
+            of_child.usual_errors(), of_child.filtered(time_constant_s)
         )
         n_base = self._n_usual
         columns = range(n_base + 6)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.stats import (
+    masked_medians,
     median,
-    medians,
     quantile,
     robust_regression,
     robust_weights,
@@ -214,7 +214,7 @@ def _residual(motions: MotionPairs) -> float:
         align_rotation_vectors(motions), np.zeros(3)
     )
     residual_rad = quantile(
-        np.linalg.norm(motions.residuals(X)[1], axis=1), USUAL
+        np.linalg.norm(motions.rotation_residuals(X), axis=1), USUAL
     )
     return (
         residual_rad
@@ -358,7 +358,8 @@ class _AlignedPositions:
         Ts_pw_c = pose_pairs.Ts_pw_p @ X
         points = se3.translation_of(Ts_pw_c)
         others = se3.translation_of(pose_pairs.Ts_cw_c)
-        R, distances_m = _alignment(points, others)
+        are_used = np.ones(len(points), dtype=bool)
+        R, distances_m = _alignment(points, others, are_used)
         return cls(pose_pairs, Ts_pw_c, points, others, R, distances_m)
 
     @cached_property
@@ -399,17 +400,12 @@ def _is_steady(aligned: _AlignedPositions) -> bool:
     Errors of X, scale and clock offset also cause differences. A robust regression removes them.
     """
     rows = aligned.regressors(se3.rotation_of(aligned.pose_pairs.Ts_pw_p))
-    values, distances_m = robust_regression(
-        "cauchy",
-        rows,
-        aligned.differences,
-        ROUNDS,
-        lambda lengths_m: 2.0 * median(lengths_m),
-    )
-    corrected = aligned.points + rows @ values
+    residuals = _residuals(rows, aligned.differences)
+    corrected = aligned.points + aligned.differences - residuals
     windows_m = _apart_in_windows(
         aligned.pose_pairs.stamps_ns, corrected, aligned.others
     )
+    distances_m = np.linalg.norm(residuals, axis=1)
     return median(distances_m) < _STEADY * windows_m
 
 
@@ -427,13 +423,16 @@ def _apart_in_windows(
     _, firsts, counts = np.unique(
         windows, return_index=True, return_counts=True
     )
-    distances_m = []
-    # Align all windows with the same number of points at once.
-    for count in np.unique(counts[counts >= MIN_PAIRS]):
-        rows = firsts[counts == count, None] + np.arange(count)
-        _, distances = _alignment(points[rows], others[rows])
-        distances_m += medians(distances).tolist()
-    return median(distances_m) if distances_m else 0.0
+    is_long = counts >= MIN_PAIRS
+    if not is_long.any():
+        return 0.0
+    counts = counts[is_long]
+    # Align all windows at once. Shorter windows are filled up with points that have no weight.
+    in_window = np.arange(counts.max())
+    rows = np.minimum(firsts[is_long, None] + in_window, len(points) - 1)
+    is_inside = in_window < counts[:, None]
+    _, distances_m = _alignment(points[rows], others[rows], is_inside)
+    return median(masked_medians(distances_m, is_inside))
 
 
 def _is_difference_white(aligned: _AlignedPositions) -> bool:
@@ -571,16 +570,18 @@ def _residuals(rows: FloatArray, targets: FloatArray) -> FloatArray:
 
 
 def _alignment(
-    points: FloatArray, others: FloatArray
+    points: FloatArray, others: FloatArray, is_used: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Align points (..., N, 3) robustly by a rotation and a translation.
+
+    Points outside the mask ``is_used`` (..., N) have no weight.
 
     Returns
     -------
     (..., 3, 3) array, (..., N) array
         Rotation from the others to the points, and distances of the aligned points, m.
     """
-    weights = np.ones(points.shape[:-1])
+    weights = is_used.astype(float)
     for _ in range(ROUNDS):
         shares = (weights / weights.sum(axis=-1, keepdims=True))[..., None, :]
         from_mean = points - shares @ points
@@ -591,6 +592,7 @@ def _alignment(
         )
         aligned = others_from_mean @ np.swapaxes(R, -1, -2)
         distances_m = np.linalg.norm(from_mean - aligned, axis=-1)
-        usual_m = 2.0 * medians(distances_m)[..., None] + 1e-9
-        weights = robust_weights("cauchy", (distances_m / usual_m) ** 2)
+        usual_m = 2.0 * masked_medians(distances_m, is_used)[..., None] + 1e-9
+        squared = (distances_m / usual_m) ** 2
+        weights = is_used * robust_weights("cauchy", squared)
     return R, distances_m
