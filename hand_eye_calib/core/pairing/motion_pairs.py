@@ -291,7 +291,10 @@ class MotionPairs(Columns):
 
 
 def motion_pairs(
-    Ts_pw_p: FloatArray, Ts_cw_c: FloatArray, reference: str
+    Ts_pw_p: FloatArray,
+    Ts_cw_c: FloatArray,
+    reference: str,
+    every: int = 1,
 ) -> MotionPairs:
     """Return the relative motions of two synchronised trajectories for a reference.
 
@@ -306,6 +309,8 @@ def motion_pairs(
         pose before it. ``"C<n>"``: in segments of n poses, from the first pose of the segment to
         every other pose of it. As in the published results, segments that start at pose N - n or
         later are skipped.
+    every : int
+        Only every k-th motion pair is computed.
 
     Returns
     -------
@@ -326,7 +331,7 @@ def motion_pairs(
     else:
         j = np.arange(step, n_poses)
         i = np.zeros_like(j) if kind == "A" else j - step
-    return pairs_between(Ts_pw_p, Ts_cw_c, i, j.ravel())
+    return pairs_between(Ts_pw_p, Ts_cw_c, i[::every], j.ravel()[::every])
 
 
 def pairs_between(

@@ -177,10 +177,11 @@ def solve_strides(
     for n_poses in _STRIDES:
         if n_poses == 1 or _MIN_MOTIONS * n_poses < len(Ts_pw_p):
             reference = f"B{n_poses}"
-            pairs = motion_pairs(Ts_pw_p, Ts_cw_c, reference)
             every_by_overlap = n_poses // _MOTIONS_PER_STRIDE
-            every_by_number = math.ceil(len(pairs) / _MAX_MOTIONS)
-            pairs = pairs[:: max(every_by_overlap, every_by_number, 1)]
+            n_motions = len(Ts_pw_p) - n_poses
+            every_by_number = math.ceil(n_motions / _MAX_MOTIONS)
+            every = max(every_by_overlap, every_by_number, 1)
+            pairs = motion_pairs(Ts_pw_p, Ts_cw_c, reference, every)
             strides.append(
                 Stride(reference, pairs, solve(pairs, T_start, tolerance))
             )
