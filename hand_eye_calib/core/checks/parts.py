@@ -81,6 +81,9 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
             )
             for part in parts
         )
+        if _unexplained(parts[0], second) <= _OTHER_PART:
+            # One extrinsic explains both parts, as in most recordings.
+            continue
         by_own = max(
             _unexplained(parts[0], first), _unexplained(parts[1], second)
         )
