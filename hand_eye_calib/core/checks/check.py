@@ -114,12 +114,10 @@ class CheckResult:
         explains the streams.
     offset : TimeOffset or None
         Clock offset in addition to the ``time_offset_s`` of the check; None without a fit.
-    Two readings that fit about equally well, if the chosen reading may be wrong; otherwise None.
-    The second reading also inverts both streams.
-        Two readings that fit about equally well, if the reading of the findings may be wrong. The
-        other reading also inverts both streams.
-    Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad. It covers faults
-    that the streams neither prove nor exclude, and is part of the allowance of a checked result.
+    readings : Readings or None
+        Two readings that fit about equally well, if the reading of the findings may be wrong;
+        otherwise None. The other reading also inverts both streams.
+    open_covariance : (6, 6) array
         Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, for faults that
         the streams neither prove nor exclude. It is part of the allowance of a checked result.
     """
