@@ -525,3 +525,11 @@ def test_after_an_alarm_an_uncertain_axis_is_not_called_unmoved():
     )
     assert line.text == "cannot tell (± 25 cm)"
     assert line.tone is Tone.UNKNOWN
+
+
+@pytest.mark.parametrize("is_learning", [True, False])
+def test_the_end_of_a_short_monitored_session_names_the_missing_digest(
+    is_learning,
+):
+    ended = replace(mount(is_learning=is_learning), has_ended=True)
+    assert ("It wrote no digest" in view_of(ended).advice) == is_learning

@@ -13,7 +13,13 @@ from hand_eye_calib.core.assessment.excitation import (
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.spelling import Interface
-from hand_eye_calib.core.base.text import duration, in_sentences, listing
+from hand_eye_calib.core.base.text import (
+    AXIS_UNITS,
+    amount,
+    duration,
+    in_sentences,
+    listing,
+)
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.results.calibration import Calibration, SolveStatus
 from hand_eye_calib.core.results.context import Comparison
@@ -240,11 +246,40 @@ def state_of_result(result: Calibration, age_s: float) -> ResultState:
         time_offset_s=result.time_offset_s,
         scale=result.scale,
         age_s=age_s,
-        facts=tuple(brief_facts_of(result)),
+        facts=(*brief_facts_of(result), *measured_parts(result)),
         angles=angles_in_words(transforms_of(result)["T_parent_child"], result),
         caution=problem,
         step=step,
     )
+
+
+def measured_parts(result: Calibration) -> list[str]:
+    """Return a line about the measured parts of the standard deviations.
+
+    More motion reduces only these parts. Without a large allowance, there is no line.
+    """
+    is_known = np.isfinite(result.sigmas)
+    if not is_known.any():
+        return []
+    measured = result.sigmas_measured[is_known]
+    is_mostly_allowance = 2.0 * measured**2 < result.sigmas[is_known] ** 2
+    if not is_mostly_allowance.all():
+        return []
+    largest: dict[str, float] = {}
+    for axis, sigma in zip(
+        np.array(AXES)[is_known].tolist(), measured.tolist(), strict=True
+    ):
+        unit = AXIS_UNITS[axis]
+        largest[unit] = max(sigma, largest.get(unit, 0.0))
+    axis_of_unit = {"m": "x", "rad": "yaw"}
+    sizes = listing(
+        [amount(axis_of_unit[unit], sigma) for unit, sigma in largest.items()]
+    )
+    verb = "is" if len(largest) == 1 else "are"
+    return [
+        f"{sizes} {verb} measured; the rest of +/- is an allowance for constant errors, which more "
+        "motion does not reduce"
+    ]
 
 
 def describe(calibration: Calibration) -> str:

@@ -388,8 +388,11 @@ def _end(state: NodeState) -> Headline:
     text = "The node has ended"
     saved = state.saved
     if state.mount is not None:
+        advice = ""
+        if state.mount.is_learning:
+            advice = "It wrote no digest, because its motion was too short."
         return Headline(
-            Tone.ACT, "ENDED", f"{text}: the mount is not monitored."
+            Tone.ACT, "ENDED", f"{text}: the mount is not monitored.", advice
         )
     if saved is None:
         if not state.result:
