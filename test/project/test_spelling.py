@@ -70,6 +70,16 @@ def test_an_option_in_a_message_is_spelled_as_its_road_does(text):
     assert spelled(text, Interface.NODE) == text
 
 
+def test_the_part_of_a_recording_is_always_an_option_of_a_command_or_of_python():
+    text = "calibrate with start 2 and end 18, at the end of which it starts"
+    typed = (
+        "calibrate with --start 2 and --end 18, at the end of which it starts"
+    )
+    assert as_typed(text) == typed
+    assert spelled(text, Interface.NODE) == typed
+    assert "with start=2 and end=18, at" in spelled(text, Interface.PYTHON)
+
+
 def test_options_are_joined_as_their_road_does():
     options = {
         "prior.z": "VALUE+/-SIGMA",

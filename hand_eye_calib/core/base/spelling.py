@@ -56,6 +56,11 @@ def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
     ``others`` has the names of further options of the interface in messages.
     """
     names = {*_FIELDS, *_CHOICES, *_TIMES, *others}
+    if interface is Interface.NODE:
+        # The parameters of the node have the names that the engine writes. Only commands take a
+        # part of a recording.
+        names = {*_TIMES}
+        interface = Interface.TERMINAL
 
     def option(match: re.Match[str]) -> str:
         name = match["quoted"] or match["name"]
@@ -68,11 +73,7 @@ def spelled(text: str, interface: Interface, others: Iterable[str] = ()) -> str:
             return spelled_options([(name, value)], interface)
         return f"{_name_alone(name, interface)} {value}"
 
-    return (
-        text
-        if interface is Interface.NODE
-        else _OPTION_IN_TEXT.sub(option, text)
-    )
+    return _OPTION_IN_TEXT.sub(option, text)
 
 
 def spelled_options(options: Pairs, interface: Interface) -> str:

@@ -93,14 +93,25 @@ def play_live(
     check: Callable[[], None],
     is_wanted: Callable[[], bool],
 ) -> None:
-    """Publish poses to the node as long as ``is_wanted()`` is true.
+    """Publish poses to the node as long as ``is_wanted()`` is true; then wait for a result.
 
     For the parameters and errors see :func:`play`.
     """
     with _player_node() as (node, executor):
         publishers = _publishers(node, topics)
+        results: list[TransformStamped] = []
+        node.create_subscription(
+            TransformStamped, "calibrator/extrinsic", results.append, LATCHED
+        )
         _wait(executor, check, partial(_are_subscribed, publishers), "listen")
         _publish_in_time(poses, publishers, speed, executor, is_wanted)
+        # A busy computer may need longer for the first result than the drive takes.
+        _wait(
+            executor,
+            check,
+            lambda: results or not is_wanted(),
+            "give a result",
+        )
 
 
 def _publishers(node: Node, topics: Mapping[str, str]) -> dict[str, Publisher]:
