@@ -52,7 +52,7 @@ def test_a_clock_offset_that_is_certain_is_used_and_said(streams):
         for text in result.warnings
         if 'solved with time_offset="estimate"' in text
     )
-    assert "the child's clock is 0.3" in warning
+    assert "the child's clock is 0.299993 +/- 0.0000" in warning
 
 
 def test_a_check_states_the_clock_offset_and_the_scale_of_the_solution(streams):

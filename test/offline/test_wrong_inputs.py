@@ -38,6 +38,13 @@ TABLE = """
 1 | calibrate lidar.tum nohead.csv | name the 4 with --child-columns
 1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set
 1 | calibrate lidar.tum camera.tum few0.tum | few0 (child) with lidar (parent): 10 synchronised
+1 | calibrate lidar.tum half.tum half2.tum | half and half2 have 0 poses at common times
+1 | calibrate ublox.csv camera.tum | and the unit (u-blox writes 1e-7 deg as whole numbers)
+2 | calibrate lidar.tum camera.tum result | to save the result in a folder, give --out result
+2 | calibrate lidar.tum camera.tum --prior z=0.2,0.01 | write 0.2+/-0.01
+2 | calibrate lidar.tum camera.tum --config root.yaml | leave out the section
+2 | calibrate lidar.tum camera.tum --target-translation 5 | must be at most 1
+2 | version | write hand_eye_calib --version
 1 | calibrate commas.csv camera.tum | names 4 columns, but the rows have 8 cells; their numbers seem
 1 | calibrate commas.txt camera.tum | with decimal points, or with ; between cells
 1 | calibrate float32.tum camera.tum | are the same (numbers of 32 bits have steps of 128 s here)
@@ -255,6 +262,8 @@ TEXTS = {
     "kitti.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
     "times.txt": "0\n1\n",
     "bad.yaml": "a: [1\n",
+    "root.yaml": "hand_eye_calib:\n  max_gap: 0.2\n",
+    "ublox.csv": "t,lat,lon,height\n" + "1,600000000,250000000,0\n" * 9,
     "list.yaml": "- 1\n- 2\n",
     "typo.yaml": "max_gapp: 1\n",
     "value.yaml": "max_gap: fast\n",
@@ -309,6 +318,8 @@ def write_poses(folder):
     poses = {
         "short": rows[:, :7],
         "few": rows[:4],
+        "half": rows[:300],
+        "half2": rows[300:],
         "few0": np.c_[np.arange(30), rows[:30, 1:]],
         "quat2": double,
         "zeroq": no_rotation,

@@ -28,6 +28,14 @@ IN_PYTHON = {
         lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),
         "multiply seconds by 1e9 and round them",
     ),
+    "poses as positions": (
+        lambda: hec.Trajectory.from_positions(LIDAR.stamps_ns, LIDAR.poses),
+        "positions must be numbers of shape (N, 3); found shape (600, 4, 4)",
+    ),
+    "a file of samples": (
+        lambda: hec.calibrate_arm("arm.yaml"),
+        "samples = hec.read_arm_samples(path)",
+    ),
     "a number as prior": (
         lambda: hec.CalibratorConfig(prior_z=1.85),
         "prior.z must be a text with its standard deviation, such as '1.85",
@@ -98,6 +106,11 @@ def test_a_wrong_argument_in_python_is_answered_in_one_line(name):
         call()
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_attribute_of_a_result_has_the_near_name():
+    with pytest.raises(AttributeError, match="did you mean sigmas"):
+        _ = RESULT.sigma
 
 
 def test_a_result_with_exchanged_frames_is_compared_as_its_inverse():

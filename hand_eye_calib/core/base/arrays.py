@@ -24,9 +24,18 @@ def floats(name: str, values: ArrayLike, columns: int = 0) -> FloatArray:
     """
     try:
         array = np.asarray(values, dtype=float)
-        return array.reshape(-1, columns) if columns else array
     except (TypeError, ValueError):
-        shape = f" of shape (N, {columns})" if columns else ""
+        array = None
+    shape = f" of shape (N, {columns})" if columns else ""
+    if array is None:
         raise InputError(
             f"{name} must be numbers{shape}; got {type(values).__name__}"
-        ) from None
+        )
+    if not columns:
+        return array
+    # A flat array is a sequence of rows.
+    if array.ndim > 1 and array.shape[1:] != (columns,) or array.size % columns:
+        raise InputError(
+            f"{name} must be numbers{shape}; found shape {array.shape}"
+        )
+    return array.reshape(-1, columns)

@@ -327,7 +327,7 @@ class CalibratorConfig(OptionSet):
         "Standard deviation along each axis that is good enough, for the "
         "verdict and the stop rule.",
         unit="m",
-        within=(1e-6, 100.0),
+        within=(1e-6, 1.0),
     )
     target_rotation: float = option(
         0.00524,

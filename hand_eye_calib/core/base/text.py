@@ -289,7 +289,13 @@ def parse_prior(name: str, text: str) -> tuple[float, float]:
     unit = AXIS_UNITS[name.removeprefix("prior.")]
     form = "VALUE+/-SIGMA, with its standard deviation"
     if not sigma:
-        raise ConfigError(f"{name} must be {form}; got {shown_value(text)}")
+        hint = ""
+        first, _, second = value.partition(",")
+        if "." in first and second:
+            hint = f"; write {first}+/-{second.strip()}"
+        raise ConfigError(
+            f"{name} must be {form}; got {shown_value(text)}{hint}"
+        )
     (prior,) = quantities(name, [unit], value.split(), form)
     (prior_sigma,) = quantities(name, [unit], sigma.split(), form, 0.0)
     unit_of_value = _unit_of(value)

@@ -24,7 +24,8 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
     ``added_s`` (s) was already added to the child's stamps.
     """
     values = offset_values(offset.seconds, added_s) | {
-        "sigma_s": offset.sigma_s
+        "sigma_s": offset.sigma_s,
+        "size": with_sigma(abs(offset.seconds), offset.sigma_s, 4),
     }
     values["beyond"] = (
         f" beyond the {added_s:.4f} s that were added" if added_s else ""

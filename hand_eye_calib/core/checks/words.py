@@ -228,11 +228,11 @@ WORDS = {
         code="inverse_both",
     ),
     "time_offset": FindingWords(
-        "the child's clock is {size_s:.4f} +/- {sigma_s:.2g} s {direction} the parent's{beyond}",
+        "the child's clock is {size} s {direction} the parent's{beyond}",
         "have the offset estimated (time_offset estimate), or set it",
     ),
     "needless_time_offset": FindingWords(
-        "the child's clock is {size_s:.4f} +/- {sigma_s:.2g} s {direction} the parent's{beyond}",
+        "the child's clock is {size} s {direction} the parent's{beyond}",
         "omit the offset, because the clocks agree without it",
         code="time_offset",
     ),
@@ -330,7 +330,8 @@ WORDS = {
     ),
     "axis_scale": FindingWords(
         "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its others",
-        "write all coordinates in metres, from one source",
+        "write all coordinates in metres, from one source; check that latitude and longitude are "
+        "not exchanged",
         "heights in feet, of a barometer or constant (2D), or map coordinates whose scale depends "
         "on the latitude",
     ),

@@ -20,6 +20,7 @@ from typing import TypeAlias
 from hand_eye_calib.core.base.config import defaults_of
 from hand_eye_calib.core.base.errors import NotEnoughDataError
 from hand_eye_calib.core.base.option import Options
+from hand_eye_calib.core.base.text import with_sigma
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
@@ -452,8 +453,8 @@ def _with_estimate_warnings(
     }
     offset_s = calibration.time_offset_s
     reasons["time_offset"] = (
-        f"the child's clock is {abs(offset_s):.4f} +/- {calibration.time_offset_sigma_s:.2g} "
-        f"s {offset_values(offset_s)['direction']} the parent's"
+        f"the child's clock is {with_sigma(abs(offset_s), calibration.time_offset_sigma_s, 4)} s "
+        f"{offset_values(offset_s)['direction']} the parent's"
     )
     rate = calibration.clock_rate
     if rate and rate.is_used:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from hand_eye_calib.core.base.text import with_sigma
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
 from hand_eye_calib.core.checks.findings import Finding
 from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
@@ -29,7 +30,9 @@ def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
     if finding.key != "time_offset" or not calibration.time_offset_sigma_s:
         return finding
     values = offset_values(calibration.time_offset_s)
-    values |= {"sigma_s": calibration.time_offset_sigma_s, "beyond": ""}
+    sigma_s = calibration.time_offset_sigma_s
+    size = with_sigma(abs(calibration.time_offset_s), sigma_s, 4)
+    values |= {"sigma_s": sigma_s, "size": size, "beyond": ""}
     options = {"time_offset": values["total_s"]}
     return replace(
         finding, values={**finding.values, **values}, options=options

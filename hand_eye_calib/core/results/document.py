@@ -443,6 +443,8 @@ def _about_axes_in_words(
         for sigma in about_deg[are_known].tolist()
     ]
     word = "axes" if len(axes) > 1 else "axis"
+    if len({*sizes}) == 1:
+        sizes = sizes[:1]
     return (
         f"roll, pitch and yaw are turns one after the other; about the {word} {listing(axes)} "
         f"the rotation is good to {listing(sizes)}"

@@ -9,6 +9,7 @@ import numpy as np
 from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
+from hand_eye_calib.core.base.option import did_you_mean
 from hand_eye_calib.core.base.registry import OUT_OF_REACH
 from hand_eye_calib.core.base.text import frame_name
 from hand_eye_calib.core.geometry import se3
@@ -199,8 +200,11 @@ class Result:
                         if value is None
                         else extra.attribute(value, name)
                     )
+            similar = (
+                "" if name.startswith("_") else did_you_mean(name, dir(self))
+            )
             raise AttributeError(
-                f"{type(self).__name__!r} object has no attribute {name!r}"
+                f"{type(self).__name__!r} object has no attribute {name!r}{similar}"
             )
 
     def with_part(self, name: str, value: object) -> Self:

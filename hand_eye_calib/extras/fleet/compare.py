@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     results = "extrinsic.yaml, or the directory that contains it; two or more without --with"
     parser.add_argument("results", metavar="RESULT", nargs="+", help=results)
     installed = (
-        "installed transform: a URDF, an earlier extrinsic.yaml, a file of "
-        "another program (formats of info --as), a bag with /tf_static, or "
+        "installed transform: a URDF, an earlier extrinsic.yaml, a file of another program "
+        "(formats of info --as), a file of one pose (.tum), a bag with /tf_static, or "
         '"X Y Z ROLL PITCH YAW" in m and rad'
     )
     parser.add_argument(

@@ -206,6 +206,11 @@ def _between(
     ``config`` has the options of the first result. Both neighbours are of the kind ``child_kind``.
     """
     pairs = synchronise(parent, child, config.max_gap)
+    if len(pairs) < config.min_pairs:
+        raise NotEnoughDataError(
+            f"{parent.sensor_frame} and {child.sensor_frame} have {len(pairs)} poses at common "
+            "times: leave one of these sensors out"
+        )
     of_neighbours = CalibratorConfig(
         method=method,
         max_pairs=max(len(pairs), 10),

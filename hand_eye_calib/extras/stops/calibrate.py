@@ -134,7 +134,7 @@ def _names_of_frames(names: Any) -> dict[str, str]:
 
 def calibrate_arm(
     robot: Any,
-    tracking: Any,
+    tracking: Any = None,
     config: Any = None,
     names: Any = None,
     setup: str | None = None,
@@ -175,6 +175,11 @@ def calibrate_arm(
     >>> hec.calibrate_arm(samples.robot, samples.tracking).n_poses
     40
     """
+    if tracking is None:
+        raise InputError(
+            "the poses of the target are missing: pass robot and tracking; a file has both: "
+            "samples = hec.read_arm_samples(path), then samples.robot, samples.tracking"
+        )
     if _are_arrays_of_opencv(config, names):
         robot, tracking = (robot, tracking), (config, names)
         config = names = None

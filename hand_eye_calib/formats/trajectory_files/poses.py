@@ -248,7 +248,8 @@ def _on_earth(table: Table, up: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         lambda row: (
             f"found latitude {np.degrees(lat_rad[row]):.7g} deg, longitude "
             f"{np.degrees(lon_rad[row]):.7g} deg; the limit of the latitude "
-            "is 90 deg: check whether both are swapped"
+            "is 90 deg: check whether both are swapped, and the unit (u-blox writes 1e-7 deg as "
+            "whole numbers)"
         ),
     )
     height_m = (

@@ -134,6 +134,12 @@ def _unknown_option(path: Path, option: str) -> ConfigError:
             f"{path}: {option!r} is no parameter; give {typed} TOPIC (for the node: "
             f"-r {remap}:=TOPIC)"
         )
+    section, _, rest = option.partition(".")
+    if rest in OPTION_FIELDS:
+        return ConfigError(
+            f"{path}: leave out the section {section!r}: options are at the top level, or below "
+            f"calibrator: {_ROS_SECTION}"
+        )
     # Quotes protect the names from as_typed(), so that they keep the spelling of the file.
     names = sorted(map(repr, OPTION_FIELDS))
     hint = (

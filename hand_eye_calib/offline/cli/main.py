@@ -175,6 +175,8 @@ def _unknown_command(word: str, argv: Sequence[str]) -> str:
     """Return the message about a first word that is no command."""
     if word == "help":
         return "write hand_eye_calib COMMAND --help"
+    if word == "version":
+        return "write hand_eye_calib --version"
     if line := calibrating(argv):
         return f"{word!r} is a path; a command comes first: {line}"
     known = ", ".join(COMMANDS)

@@ -44,6 +44,11 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
             )
         if isinstance(path, Path):
             refuse_saved_result(path)
+    last = Path(paths[-1]) if len(paths) == 3 else None
+    if last and not (last.suffix or last.exists() or "*" in str(last)):
+        raise ConfigError(
+            f"no file {last}; to save the result in a folder, give --out {last}"
+        )
     if (
         command == "replay"
         and len(paths) > 1

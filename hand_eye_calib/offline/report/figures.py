@@ -129,7 +129,7 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
     child = calibration.child_frame
     world = calibration.parts["worlds"].child_world_frame
     figure, panels = make_panels(3.25, 1, 3, gap=0.36)
-    for panel, axes in zip(panels, VIEWS, strict=True):
+    for panel, (axes, title) in zip(panels, VIEWS.items(), strict=True):
         columns = ["xyz".index(axis) for axis in axes]
         points = positions[:, columns]
         ends = (positions + line_m * directions)[:, columns]
@@ -148,7 +148,7 @@ def _figure_of_stops(calibration: Calibration) -> Drawn:
                 *points[~is_used].T, "x", color=BAD, ms=5.5, label="left out"
             )
         panel.plot(0.0, 0.0, "s", color=PARENT, ms=6, label=plain_label(world))
-        panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)")
+        panel.set(xlabel=f"{axes[0]} (m)", ylabel=f"{axes[1]} (m)", title=title)
         panel.set_aspect("equal", adjustable="datalim")
     lines, _ = panels[0].get_legend_handles_labels()
     caption = (
