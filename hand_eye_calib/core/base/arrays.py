@@ -34,7 +34,8 @@ def floats(name: str, values: ArrayLike, columns: int = 0) -> FloatArray:
     if not columns:
         return array
     # A flat array is a sequence of rows.
-    if array.ndim > 1 and array.shape[1:] != (columns,) or array.size % columns:
+    has_other_rows = array.ndim > 1 and array.shape[1:] != (columns,)
+    if has_other_rows or array.size % columns:
         raise InputError(
             f"{name} must be numbers{shape}; found shape {array.shape}"
         )

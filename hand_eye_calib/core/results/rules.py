@@ -251,8 +251,8 @@ def _few_inliers(result: Result) -> Iterator[Ground]:
     if share < _fewest_inliers(result):
         text = f"{1 - share:.0%} of the motion pairs were rejected as outliers"
         advice = (
-            "look in the report for jumps of an odometry; without jumps, a clock is too fast or too "
-            "slow, or a stream has too few poses per second"
+            "look in the report for jumps of an odometry; without jumps, a clock is too fast or "
+            "too slow, or a stream has too few poses per second"
         )
         if result.reference == "windows":
             # The outliers of a vehicle are slips.

@@ -114,8 +114,7 @@ def calibrated(
             attempts.append(run(snapshot))
         except NotEnoughDataError as error:
             raise NotEnoughDataError(
-                f"{other.sensor_frame} (child) with {first.sensor_frame} (parent): {error}; or "
-                "leave that sensor out"
+                f"{other.sensor_frame} (child) with {first.sensor_frame} (parent): {error}"
             ) from None
     # Results with the first sensor, and the other trajectories on the clock and in the unit of the
     # first trajectory.
