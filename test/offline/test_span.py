@@ -149,6 +149,30 @@ def test_python_files_and_bags_use_the_same_part(
     assert [stream["poses"] for stream in streams.values()] == [301, 301]
 
 
+def test_a_batch_uses_the_part_and_repeats_it_for_another(
+    drive, tmp_path, capsys
+):
+    bag = tmp_path / "bag"
+    streams = zip(("/parent", "/child"), drive, strict=True)
+    write_bag(
+        bag,
+        {topic: (poses, "nav_msgs/msg/Odometry") for topic, poses in streams},
+    )
+    command = ["batch", str(bag), "--no-report", "--jobs", "1"]
+    command += ["--out", str(tmp_path / "out"), "--json"]
+    command += ["--parent-topic", "/parent", "--child-topic", "/child"]
+    durations_s = []
+    for end in ("20", "20", "30"):
+        main([*command, "--start", "5", "--end", end])
+        printed = capsys.readouterr()
+        (result,) = json.loads(printed.out)["results"]
+        stream = result["inputs"]["parent"]
+        stamps_ns = stream["last_stamp_ns"] - stream["first_stamp_ns"]
+        is_reused = "are done already" in printed.err
+        durations_s.append((round(stamps_ns * 1e-9), is_reused))
+    assert durations_s == [(15, False), (15, True), (25, False)]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
