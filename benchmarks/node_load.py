@@ -526,7 +526,7 @@ def kill(folder, kills):
             (newest_ns - min(newest(journal, stream) for stream in STREAMS))
             * 1e-9
         )
-        # The node adds its own topics.
+        # The node may add files for its topics.
         unchanged += before.items() <= fingerprints(output).items()
         load_result(output)
     code, _ = node.stop(15)

@@ -2,13 +2,13 @@
 
     python benchmarks/node_sessions.py [SESSION ...] [--out DIRECTORY] [--seed SEED]
 
-Twelve sessions are a minute or two of simulated driving, published in real time, with one accident
-(a knock, a stream that stops, a wrong ``installed`` ...). In two sessions, a vehicle drives over
-ramps for ten minutes. The node's advice and times left are compared with the rest of the session. A
-witness records the state of the node, its topics, ``/diagnostics``, ``/tf_static``, the page of
-``watch``, the log and the saved files. Their contents are compared at every second, and every
-screen with the rules of ``test/screen_rules.py``. Prints a table. The exit code is 1 if contents
-contradict each other, or a session does not end as expected. With ``--out``, all pages and
+Twelve sessions are a minute or two of simulated driving, published in real time. Most have an
+accident: a knock, a stream that stops, a wrong ``installed`` ... In two sessions, a vehicle drives
+over ramps for ten minutes. The node's advice and times left are compared with the rest of the
+session. A witness records the state of the node, its topics, ``/diagnostics``, ``/tf_static``, the
+page of ``watch``, the log and the saved files. Their contents are compared at every second, and
+every screen with the rules of ``test/screen_rules.py``. Prints a table. The exit code is 1 if
+contents contradict each other, or a session does not end as expected. With ``--out``, all pages and
 headlines are saved (``watch_picture.py`` makes a moving picture of them).
 """
 
@@ -88,9 +88,9 @@ MIN_ROTATION_DEG = 30.0
 # Numbers of a line of the log.
 NUMBERS = r"[\d.,+-]+"
 
-# Promises to the driver of a vehicle: time (s) from the moment when all axes are within their
-# targets for good to DONE, and smallest share of the times left within a factor of two.
+# Longest time (s) from the moment when all axes are within their targets for good, to DONE.
 MAX_WAIT_S = 90.0
+# Smallest share of the reported times left that are within a factor of two of the truth.
 MIN_GOOD_TIMES = 0.8
 
 # Headlines that may replace DONE and GO ON at any time.
@@ -111,7 +111,7 @@ class Streams:
 
 @dataclass(frozen=True)
 class Session:
-    """One session: motion, accident, and the headline with which it must end.
+    """Motion and accident of a session, and the headline with which the session must end.
 
     Attributes
     ----------
@@ -175,9 +175,9 @@ def end_child(streams):
 
 
 def park(streams):
-    """Stand still from 25 to 55 s; the drive goes on from there.
+    """Park from 25 to 55 s; the drive then continues at the same place.
 
-    Both sensors stand at their pose of the same instant, not at that of their nearest message.
+    The poses of both sensors while parked are interpolated at the same instant.
     """
     for name in ("parent", "child"):
         times_s = getattr(streams, f"{name}_s")
@@ -376,8 +376,8 @@ class Page:
     @property
     def word(self):
         """The headline in capitals."""
-        found = re.search(r"<h1><span[^>]*>.</span> ([^<]*)</h1>", self.html)
-        return unescape(found[1]) if found else ""
+        match = re.search(r"<h1><span[^>]*>.</span> ([^<]*)</h1>", self.html)
+        return unescape(match[1]) if match else ""
 
     @property
     def headline(self):
@@ -404,8 +404,8 @@ class Page:
 
     @property
     def verdict(self):
-        found = re.search(r"<b>verdict</b> ([^<]*)</p>", self.html)
-        return found[1] if found else ""
+        match = re.search(r"<b>verdict</b> ([^<]*)</p>", self.html)
+        return match[1] if match else ""
 
 
 class Witness:
@@ -809,8 +809,8 @@ def run(name, session, folder, seed):
         problems.append(
             (math.inf, f"ends with {last.headline!r}, not {session.ends_with}")
         )
-    shown = "\n".join(page.html for _, page in witness.pages)
-    if not re.search(session.must_appear, unescape(shown)):
+    all_pages = "\n".join(page.html for _, page in witness.pages)
+    if not re.search(session.must_appear, unescape(all_pages)):
         problems.append(
             (math.inf, f"the page has never displayed {session.must_appear!r}")
         )

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
 from hand_eye_calib.offline.cli.main import exit_code_of
@@ -187,11 +188,11 @@ def solve_and_write(
     no artefact is left.
     """
     wanted = GROUPS[identifier]
-    artefacts = [
-        artefact
-        for artefact in wanted
-        if all(cell.dataset in source.datasets for cell in artefact.cells)
-    ]
+    artefacts = []
+    for artefact in wanted:
+        datasets = {cell.dataset for cell in artefact.cells}
+        if datasets <= set(source.datasets):
+            artefacts.append(artefact)
     if not artefacts:
         raise ConfigError(
             f"{identifier} is about the KITTI drives: use --data published"
@@ -201,13 +202,15 @@ def solve_and_write(
             "figures and tables of the KITTI drives are left out: they need the published data"
         )
     out.mkdir(parents=True, exist_ok=True)
-    todo = dict.fromkeys(
-        cell for artefact in artefacts for cell in artefact.cells
-    )
-    solved = in_parallel(solve_cell, [(source, cell) for cell in todo], jobs)
-    results = Results(
-        source, table_of([row for rows in solved for row in rows]), out, jobs
-    )
+    # Artefacts may share cells. The keys of a dictionary keep their order.
+    different: dict[Cell, None] = {}
+    for artefact in artefacts:
+        different |= dict.fromkeys(artefact.cells)
+    tasks = [(source, cell) for cell in different]
+    rows: list[dict[str, Any]] = []
+    for rows_of_cell in in_parallel(solve_cell, tasks, jobs):
+        rows += rows_of_cell
+    results = Results(source, table_of(rows), out, jobs)
     return results, {
         artefact.name: artefact.write(artefact.name, results)
         for artefact in artefacts

@@ -197,8 +197,9 @@ def _row(
     """Return the row of a variant: its errors divided by those of the full estimator.
 
     For each family, the row contains the geometric means of the ratios of translation and rotation
-    errors. Then follow the geometric mean over all families, the same mean without the family of
-    the largest ratio, the share of true values in 90 % intervals, and the time.
+    errors. Further columns are the geometric mean over all families, and the same mean without the
+    family of the largest ratio. The last columns are the share of true values in 90 % intervals,
+    and the time.
 
     Parameters
     ----------

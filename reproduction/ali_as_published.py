@@ -83,9 +83,10 @@ def solve(pairs: MotionPairs) -> Solution:
 def _descent_step(
     gradient: FloatArray, hessian: FloatArray, last_shift: float
 ) -> tuple[FloatArray, float]:
-    """Newton step, and the shift of the Hessian's diagonal that makes it positive definite.
+    """Return the Newton step, and the shift of the Hessian's diagonal for the next step.
 
-    The first shift is zero. Further shifts grow from about a third of the last one.
+    Shifts are tried until the Hessian is positive definite: first zero, then growing shifts from
+    about a third of ``last_shift``.
     """
     growth = 100.0
     first_shift = 1e-4
@@ -126,7 +127,7 @@ _P = np.array(
 
 
 def _factor(q: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """``sqrt(|q|)`` with its gradient and Hessian."""
+    """Return ``sqrt(|q|)``, its gradient (4,) and its Hessian (4, 4)."""
     squared = q @ q
     factor = float(squared**0.25)
     gradient = factor * q / (2 * squared)
@@ -136,7 +137,10 @@ def _factor(q: FloatArray) -> tuple[float, FloatArray, FloatArray]:
 
 
 def _lift(parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The thirteen numbers x = (vec M(q), t, 1) and their derivative (13, 7)."""
+    """Return the thirteen numbers x = (vec M(q), t, 1) and their derivative (13, 7).
+
+    ``parameters`` (7,) are q and t. The residuals are linear in x.
+    """
     q = parameters[:4]
     factor, factor_gradient, _ = _factor(q)
     half_gradient = _P @ q
@@ -159,7 +163,10 @@ def _value(parameters: FloatArray, rows: FloatArray) -> float:
 def _derivatives(
     parameters: FloatArray, rows: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Cost, gradient (7,) and Hessian (7, 7)."""
+    """Return the cost, its gradient (7,) and its Hessian (7, 7) with respect to q and t.
+
+    ``rows`` (n, 13) are the residuals as linear functions of x, see :func:`_lift`.
+    """
     x, derivative = _lift(parameters)
     q = parameters[:4]
     residuals = rows @ x

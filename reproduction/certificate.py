@@ -30,7 +30,7 @@ _HIGHER = 1e-3
 
 
 def write(name: str, results: Results) -> list[Path]:
-    """Try to prove every answer and write ``NAME.md`` and ``NAME.csv``; returns their paths."""
+    """Try to prove every answer; write ``NAME.md`` and ``NAME.csv``, and return their paths."""
     datasets = [
         dataset
         for dataset in (*SIMULATED, *KITTI)
@@ -74,11 +74,10 @@ def write(name: str, results: Results) -> list[Path]:
 def prove_level(
     source: Source, dataset: str, level: float | None
 ) -> list[dict[str, Any]]:
-    """Return the proofs of the cases of a data set at a level.
+    """Try to prove all answers to the cases of a data set at a level.
 
-    A proof says whether the answer was proved, and how long that took. It also counts the other
-    local minima that are reached from the answer rotated by pi, and those of them that were proved
-    by mistake.
+    A row contains whether the answer was proved, and the time. It also contains the number of false
+    minima, see :func:`_false_minima`, and the number of false minima that were proved by mistake.
     """
     proofs = []
     for case in source.cases(dataset, level):

@@ -45,7 +45,7 @@ def positions_of(stream: Trajectory) -> FloatArray:
 
 
 def angles_of(stream: Trajectory) -> FloatArray:
-    """Yaw, pitch and roll (N, 3), rad."""
+    """Return yaw, pitch and roll (N, 3), rad."""
     rotations = Rotation.from_matrix(se3.rotation_of(stream.poses))
     return rotations.as_euler("ZYX")
 
@@ -69,7 +69,7 @@ def at_stamps(stamps_ns: Any, poses: FloatArray) -> Trajectory:
 
 
 def seconds_of(stream: Trajectory) -> FloatArray:
-    """Times (N,) since the first pose, s."""
+    """Return the times (N,) since the first pose, s."""
     since_ns = stream.stamps_ns - stream.stamps_ns[0]
     return since_ns * 1e-9
 
@@ -82,7 +82,7 @@ def noisy(stream: Trajectory, metres: float, random: Random) -> Trajectory:
 
 
 def filtered(values: FloatArray, stamps_ns: Any, tau_s: float) -> FloatArray:
-    """Values (N, ...) after a first-order low-pass filter."""
+    """Apply a first-order low-pass filter with the time constant ``tau_s`` to values (N, ...)."""
     intervals_s = np.diff(stamps_ns) * 1e-9
     gains = 1.0 - np.exp(-intervals_s / tau_s)
     out = values.copy()

@@ -51,7 +51,7 @@ class Clean:
 
 
 def names(folder: Path | None) -> list[str]:
-    """Names of all clean recordings."""
+    """Return the names of all clean recordings."""
     simulated = [
         f"{kind} {seed}" for kind in (*CLASSES, *_HILLY) for seed in SEEDS
     ]
@@ -59,7 +59,7 @@ def names(folder: Path | None) -> list[str]:
 
 
 def kind_of(name: str) -> str:
-    """Kind of the recording of this name."""
+    """Return the kind of a recording: its name without seed or drive."""
     return name.rpartition(" ")[0]
 
 
@@ -71,7 +71,7 @@ def known_in(name: str, folder: Path | None) -> frozenset[str]:
 
 
 def recording(name: str, folder: Path | None) -> Clean:
-    """The recording of this name."""
+    """Return the recording with this name."""
     kind = kind_of(name)
     seed = name.rpartition(" ")[2]
     if kind not in CLASSES and kind not in _HILLY:

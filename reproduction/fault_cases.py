@@ -90,7 +90,7 @@ def fused(
 
 
 def _rotation_steps(rotations: FloatArray) -> FloatArray:
-    """Rotation vectors (N-1, 3) from each of the rotations (N, 3, 3) to the next."""
+    """Return the rotation vectors (N-1, 3) between successive rotations (N, 3, 3)."""
     return se3.rotations_between(rotations[:-1], rotations[1:])
 
 

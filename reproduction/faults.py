@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -167,11 +167,12 @@ def _cases(
     names: Sequence[str],
     methods: Sequence[MethodName] = METHODS,
 ) -> list[Case]:
+    """Return the cases of a fault in all recordings, with all severities and methods."""
     return [
         Case(fault=fault, severity=severity, recording=name, method=method)
-        for severity in range(n_severities)
-        for name in names
-        for method in methods
+        for severity, name, method in product(
+            range(n_severities), names, methods
+        )
     ]
 
 

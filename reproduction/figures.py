@@ -256,19 +256,21 @@ def write_components(name: str, results: Results) -> list[Path]:
     """
     summaries = components(results.source.cases("noise", 0.0))
     number, where = _where("4", results)
-    table = pd.DataFrame(
-        {
-            "component": component,
-            "reference": reference,
-            "unit": "m" if component in "xyz" else "deg",
-            "median": summary.centre,
-            "lower_quartile": summary.low,
-            "upper_quartile": summary.high,
-            "motions": summary.n,
-        }
-        for component, of_component in summaries.items()
-        for reference, summary in of_component.items()
-    )
+    rows = []
+    for component, of_component in summaries.items():
+        for reference, summary in of_component.items():
+            rows.append(
+                {
+                    "component": component,
+                    "reference": reference,
+                    "unit": "m" if component in "xyz" else "deg",
+                    "median": summary.centre,
+                    "lower_quartile": summary.low,
+                    "upper_quartile": summary.high,
+                    "motions": summary.n,
+                }
+            )
+    table = pd.DataFrame(rows)
     return [
         *paper_figures.draw_components(
             f"{number}. Components of the relative motions of {where} without noise",

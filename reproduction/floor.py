@@ -45,10 +45,12 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
     if result is None:
         return
     speed_m_s = usual_speed(parent.stamps_ns, parent.poses[:, :3, 3])
+    floor = np.diag(common_mode_floor(speed_m_s))
     stated = result.sigmas_measured**2
     whole = result.sigmas**2
     error = deviation(result.T_parent_child, case.T_parent_child)
     for k in np.flatnonzero(np.isfinite(stated) & np.isfinite(case.sigmas)):
+        rest = whole[k] - stated[k] - floor[k]
         yield {
             "family": case.family,
             "turns": k > 2,
@@ -57,9 +59,7 @@ def axes(case: Case) -> Iterator[dict[str, object]]:
             "truth": case.sigmas[k] ** 2,
             "stated": stated[k],
             "whole": whole[k],
-            "rest": max(
-                whole[k] - stated[k] - common_mode_floor(speed_m_s)[k, k], 0.0
-            ),
+            "rest": max(rest, 0.0),
         }
 
 
@@ -156,7 +156,10 @@ def main() -> None:
     option_names = ("time_offset", "scale", "prior")
     rng = np.random.default_rng(seed)
     cases = real_cases(folder, arguments.pieces, rng, option_names)
-    axis_rows = pd.DataFrame([row for case in cases for row in axes(case)])
+    rows: list[dict[str, object]] = []
+    for case in cases:
+        rows += axes(case)
+    axis_rows = pd.DataFrame(rows)
     show(arguments.page, {"floor": f"Seed {seed}.\n\n{table(axis_rows)}"})
 
 

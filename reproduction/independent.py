@@ -404,11 +404,9 @@ def main() -> None:
     folder = arguments.data_folder or parser.error(
         "name the recordings with --data-folder"
     )
-    rows = [
-        row
-        for study in (ethz, camodocal, moveit, wise, ntu_viral)
-        for row in study(folder)
-    ]
+    rows: list[Row] = []
+    for study in (ethz, camodocal, moveit, wise, ntu_viral):
+        rows += study(folder)
     rows += shrimp(folder, arguments.segments)
     show(arguments.page, {"recordings": markdown_table(map(vars, rows))})
 

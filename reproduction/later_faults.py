@@ -97,7 +97,7 @@ def remounted(
     unit="s",
 )
 def held(child: Trajectory, interval_s: float, _: Random) -> Trajectory:
-    """A slow source published fast: each pose is repeated until there is a new one."""
+    """Repeat a pose until the next interval, like a slow source that is published fast."""
     elapsed_s = seconds_of(child)
     intervals = (elapsed_s / interval_s).astype(int)
     first_of_interval = np.searchsorted(intervals, intervals)
@@ -324,7 +324,7 @@ def in_bursts(child: Trajectory, seconds: float, _: Random) -> Trajectory:
 def turned_positions(
     stream: Trajectory, degrees: float, _: Random
 ) -> Trajectory:
-    """Positions in a world that is turned about z against that of the orientations."""
+    """Turn the positions about z of the world; the orientations stay."""
     turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return with_parts(stream, positions=positions_of(stream) @ turn.T)
 

@@ -176,9 +176,9 @@ def _poses(
 ) -> FloatArray:
     """Return poses of the base on a floor with bumps; the body leans outwards in curves.
 
-    ``noise`` multiplies bumps and lean. With 1, the bumps have standard deviations of 4 mrad in
-    roll and pitch and 3 mm in height, and a correlation time of 0.3 s. The lean is 10 mrad for a
-    lateral acceleration of 1 m/s^2.
+    ``noise`` multiplies bumps and lean. For a noise of 1, the bumps have standard deviations of
+    4 mrad in roll and pitch and 3 mm in height, and a correlation time of 0.3 s. The lean is
+    10 mrad for a lateral acceleration of 1 m/s^2.
     """
     speed, left_speed, yaw_rate = driven
     # The vehicle pitches as the floor below it rises and falls.
@@ -278,8 +278,8 @@ def _articulated(
 ) -> FloatArray:
     """Return the speed of the front axle and the angle of the joint in the middle of a loader.
 
-    The yaw rate of the front part is ``(v sin g + l g') / (l (1 + cos g))`` for an angle g of the
-    joint, and a length l of both parts.
+    The yaw rate of the front part is ``(v sin g + l g') / (l (1 + cos g))``. v is the speed, g the
+    angle of the joint, g' its rate, and l the length of each of both parts.
     """
     length = wheelbase / 2.0
     angles = np.zeros(len(driven.speed))

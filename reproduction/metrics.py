@@ -12,9 +12,9 @@ from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 class Errors(NamedTuple):
     """Errors of a calibration: translations (m) and rotations (rad).
 
-    ``e_rt`` and ``e_rR`` are the mean relative errors over the motion pairs. They need no ground
-    truth, and do not decide which of two calibrations is nearer to the truth. ``e_at`` and ``e_aR``
-    are the absolute errors against the ground truth.
+    ``e_rt`` and ``e_rR`` are the mean relative errors over the motion pairs. Relative errors need
+    no ground truth, but a smaller one does not mean that a calibration is nearer to the truth.
+    ``e_at`` and ``e_aR`` are the absolute errors against the ground truth.
     """
 
     e_rt: float

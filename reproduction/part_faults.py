@@ -77,7 +77,7 @@ def _unchanged(values: FloatArray) -> FloatArray:
 
 
 def _low_passed(values: FloatArray, tau_s: float = 0.2) -> FloatArray:
-    """Values (N, k) at the fine rate after a first-order low-pass filter."""
+    """Apply a first-order low-pass filter to values (N, k) at the fine rate."""
     step_s = 1.0 / _FINE_HZ
     share = step_s / (tau_s + step_s)
     rest = 1.0 - share
@@ -152,7 +152,7 @@ _OTHER_WORLD = se3.exp(np.array([3.0, 4.0, 1.0, 0.1, 0.2, 2.0]))
 
 
 def _beside(stream: Trajectory, translations: FloatArray) -> Trajectory:
-    """Poses of a sensor at translations (3,) or (N, 3) in the frame of another one."""
+    """Return the poses of a sensor at translations (3,) or (N, 3) in the frame of ``stream``."""
     mounts = se3.from_rotation_translation(np.eye(3), translations)
     return replace(stream, poses=stream.poses @ mounts)
 

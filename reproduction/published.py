@@ -218,8 +218,8 @@ def _kitti_case(
     drive = folder / "kitti_tests" / name
     parent, child = (read_trajectory(drive / stream) for stream in streams)
     child = child[first:]
-    # As in the paper: the parent is interpolated at the child's stamps. Outside of the parent's
-    # stamps, its first and last segments are extrapolated.
+    # The paper interpolates the parent at the child's stamps. Outside of the parent's stamps, the
+    # first and last segments are extrapolated.
     parent_poses = parent.at(child.stamps_ns, extrapolate=True, straight=True)
     parent_at_child = Trajectory(child.stamps_ns, parent_poses)
     T_parent_child = read_trajectory(drive / truth).poses[0]

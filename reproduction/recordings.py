@@ -73,7 +73,7 @@ class Recording:
 class Truth:
     """A known extrinsic (4, 4), and its standard deviations (6,).
 
-    The standard deviations are in m along and in rad about the axes of the parent sensor. They are
+    The standard deviations are in m along and in rad about the axes of the parent sensor, and
     infinite on unknown axes.
     """
 
@@ -375,7 +375,8 @@ def _boreas_poses(path: Path, unit_ns: int) -> Trajectory:
         rows = list(csv.DictReader(file))
 
     def columns(*names: str) -> FloatArray:
-        return np.array([[float(row[name]) for name in names] for row in rows])
+        lists = [[float(row[name]) for row in rows] for name in names]
+        return np.array(lists).T
 
     rotations = Rotation.from_euler(
         "XYZ", -columns("roll", "pitch", "heading")
@@ -401,7 +402,7 @@ def between(
 ) -> Trajectory:
     """Return the poses whose stamps are between two stamps (ns).
 
-    ``stamps_ns`` are the stamps (N,) to compare; by default, those of the trajectory.
+    ``stamps_ns`` (N,) replaces the stamps of the trajectory in the comparison.
     """
     stamps_ns = trajectory.stamps_ns if stamps_ns is None else stamps_ns
     return trajectory[(stamps_ns >= first_ns) & (stamps_ns <= last_ns)]

@@ -30,8 +30,8 @@ class Summary:
     centre: float
     low: float
     high: float
-    # Of a median: the smallest and the largest value that is at most 1.5 interquartile ranges
-    # outside of the quartiles. Of a mean: the smallest and the largest value.
+    # Smallest and largest value for a mean. For a median, values that are farther than 1.5
+    # interquartile ranges outside of the quartiles do not count.
     whiskers: tuple[float, float]
     # Number of runs.
     n: int
@@ -121,8 +121,8 @@ class Table:
     ) -> float:
         """Return the value by which variants are compared.
 
-        It is the mean of the runs, averaged over the levels; for the mixture, the median of the
-        runs.
+        The value is the mean of the runs, averaged over the levels; for the mixture, the median of
+        the runs.
         """
         levels = self.levels(dataset, method)
         summaries = [

@@ -86,7 +86,7 @@ def alike(n_sensors: int) -> FloatArray:
 def unequal(n_sensors: int) -> FloatArray:
     """Return standard deviations (S, 4) that change from the first to the last sensor.
 
-    Those of translations grow by a factor of two, those of rotations decrease by a factor of two.
+    Errors of translations grow by a factor of two, errors of rotations decrease by a factor of two.
     """
     larger = np.linspace(1.0, 2.0, n_sensors)
     smaller = larger[::-1]

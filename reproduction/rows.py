@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -72,20 +73,19 @@ class Cell:
 
 def cells(datasets: Sequence[str], methods: Sequence[str]) -> list[Cell]:
     """Return the cells of data sets at all levels, for all methods."""
-    return [
-        Cell(dataset, level, method)
-        for dataset in datasets
-        for level in LEVELS.get(dataset, (None,))
-        for method in methods
-    ]
+    all_cells = []
+    for dataset in datasets:
+        for level in LEVELS.get(dataset, (None,)):
+            all_cells += [Cell(dataset, level, method) for method in methods]
+    return all_cells
 
 
 def solve_cell(source: Source, cell: Cell) -> list[dict[str, Any]]:
     """Solve a cell; return its rows by run and reference, as plain values."""
+    cases = _cases(source, cell.dataset, cell.level)
     return [
         _solve(case, cell.method, reference)
-        for case in _cases(source, cell.dataset, cell.level)
-        for reference in REFERENCES
+        for case, reference in product(cases, REFERENCES)
     ]
 
 

@@ -123,14 +123,14 @@ def outcome(
         exceeds = (errors > np.hypot(stated, 3.0 * sigmas))[
             is_stated & np.isfinite(sigmas)
         ]
-    found, of_streams = _errors_found(result, sizes, again, rng)
+    are_detected, of_streams = _errors_found(result, sizes, again, rng)
     shift = _shift_found(result, sizes, again, options, rng)
     rules = {reason.rule for reason in result.reasons}
     is_undetectable = "undetectable" in rules
     return Outcome(
         platform,
         exceeds,
-        found[is_stated],
+        are_detected[is_stated],
         of_streams,
         shift,
         cost,
@@ -164,17 +164,17 @@ def _errors_found(
     scatter, differences = injection.trials(blocks, columns, R, sigmas)
     trial = rng.integers(len(differences))
     signs = rng.choice([-1.0, 1.0], 8)
-    wrong = differences[trial, :6] + signs[:6] * np.array(
-        [*sizes.errors.values()]
-    )
-    found = np.abs(wrong) > injection.thresholds_of(scatter[:6], allowance[:6])
+    injected = signs[:6] * np.array([*sizes.errors.values()])
+    wrong = differences[trial, :6] + injected
+    thresholds = injection.thresholds_of(scatter[:6], allowance[:6])
+    are_detected = np.abs(wrong) > thresholds
     columns = [*range(8)]
     scatter, differences = injection.trials(blocks, columns, R, sigmas)
     thresholds = injection.thresholds_of(scatter, allowance)
     estimates = blocks.solve(columns)
     late_s = signs[6] * sizes.time_offset_s
     longer = signs[7] * sizes.scale
-    found_in_streams = []
+    are_detected_in_streams = []
     for column, change in (
         (6, lambda size_s: pairs.child_shifted(late_s - size_s)),
         (7, lambda size: pairs.child_scaled(1.0 + longer + size)),
@@ -185,8 +185,8 @@ def _errors_found(
             changed = injection.evidence_of(change(estimate), X).solve(columns)
             estimate += (changed - estimates)[column]
         difference = differences[trial, column] + estimate
-        found_in_streams.append(abs(difference) > thresholds[column])
-    return found, np.array(found_in_streams)
+        are_detected_in_streams.append(abs(difference) > thresholds[column])
+    return are_detected, np.array(are_detected_in_streams)
 
 
 def _shift_found(

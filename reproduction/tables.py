@@ -3,6 +3,7 @@
 Errors are against the published ground truth and against the rectified ground truth.
 """
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,8 @@ _DRIVES = {
     "kitti_long": "Camera to camera calibration on KITTI 2011_10_03_drive_0027",
 }
 VARIANT_TABLES = {
-    f"tableS{number}": (dataset, method)
-    for number, (dataset, method) in enumerate(
-        ((dataset, method) for dataset in _DRIVES for method in METHODS),
-        start=1,
-    )
+    f"tableS{number}": variant
+    for number, variant in enumerate(product(_DRIVES, METHODS), start=1)
 }
 
 # Tables 1 and 2 as printed in the paper: best variant; e_rt, e_rR, e_at, e_aR; improvement of e_at
@@ -89,7 +87,10 @@ def with_rectified(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def best_variants(rows: pd.DataFrame, by: str = _ERRORS[2]) -> pd.DataFrame:
-    """Return, for each method, the row of :func:`with_rectified` with the smallest error ``by``."""
+    """Select the variant of each method with the smallest error ``by``.
+
+    ``rows`` are from :func:`with_rectified`.
+    """
     best = []
     for method in METHODS:
         rows_of_method = rows.loc[[method]]

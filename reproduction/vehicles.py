@@ -115,18 +115,14 @@ def disturbed(seed: int, n_drives: int) -> list[dict[str, object]]:
             drive(seed + row, model, course, slip, ramp_deg)
             for row in range(n_drives)
         ]
-        largest = {
-            axis: _with_unit(
-                axis, max(abs(item.errors[axis]) for item in results)
-            )
-            for axis in ("x", "y", "yaw")
-        }
-        ratios = [
-            item.ratios[axis]
-            for item in results
-            for axis in largest
-            if axis in item.ratios
-        ]
+        largest = {}
+        ratios = []
+        for axis in ("x", "y", "yaw"):
+            errors = [abs(item.errors[axis]) for item in results]
+            largest[axis] = _with_unit(axis, max(errors))
+            ratios += [
+                item.ratios[axis] for item in results if axis in item.ratios
+            ]
         rows.append(
             {
                 "Drive": name,

@@ -47,7 +47,7 @@ def markdown_table(rows: Iterable[TableRow]) -> str:
 
 
 def put_into_page(page: Path, name: str, text: str) -> None:
-    """Put Markdown between the lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->`` of a page.
+    """Write Markdown between the lines ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->``.
 
     A heading at the beginning of the Markdown is removed. Raises InputError if the page has no such
     lines.

@@ -78,7 +78,7 @@ def drives(sizes):
 def messages(first, count, rate_hz):
     """Return trajectories of both sensors with noise, in a smooth motion about all axes.
 
-    They contain the poses with numbers from ``first`` to ``first + count``.
+    The trajectories contain the poses with numbers from ``first`` to ``first + count``.
     """
     numbers = first + np.arange(count)
     s = numbers / rate_hz
@@ -115,16 +115,15 @@ def messages(first, count, rate_hz):
 
 def parts(first, count, rate_hz):
     """Return the fields of messages by stream: lists of stamps (ns), positions and quaternions."""
-    return {
-        stream: (
+    trajectories = messages(first, count, rate_hz)
+    fields = {}
+    for stream, trajectory in zip(STREAMS, trajectories, strict=True):
+        fields[stream] = (
             trajectory.stamps_ns.tolist(),
             trajectory.poses[:, :3, 3].tolist(),
             se3.to_quat_xyzw(trajectory.poses).tolist(),
         )
-        for stream, trajectory in zip(
-            STREAMS, messages(first, count, rate_hz), strict=True
-        )
-    }
+    return fields
 
 
 def simulated_drive(n_poses, seed=0):

@@ -105,21 +105,16 @@ def _growth(source, rows):
 
 def _side_by_side(title, rows):
     """Return the table of all methods on a drive: time, objective and errors."""
-    return Table(
-        title,
-        ["time", "objective", "e_at, m", "e_aR, deg"],
-        [
-            [
-                row.name,
-                _cell(row),
-                f"{row.objective:.6f}" if row.name.startswith("dnl") else "",
-                f"{row.error_m:.3f}",
-                f"{np.degrees(row.error_rad):.3f}",
-            ]
-            for row in rows
-            if row.error_m is not None and row.name != OPENCV
-        ],
-    )
+    lines = []
+    for row in rows:
+        if row.error_m is None or row.name == OPENCV:
+            continue
+        has_objective = row.name.startswith("dnl")
+        objective = f"{row.objective:.6f}" if has_objective else ""
+        metres = f"{row.error_m:.3f}"
+        degrees = f"{np.degrees(row.error_rad):.3f}"
+        lines.append([row.name, _cell(row), objective, metres, degrees])
+    return Table(title, ["time", "objective", "e_at, m", "e_aR, deg"], lines)
 
 
 def _others(rows, memory):

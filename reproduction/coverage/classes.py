@@ -39,7 +39,7 @@ class RecordingClass:
 
 @dataclass(frozen=True, kw_only=True)
 class Simulated:
-    """One recording of a class as measured, with the true extrinsic."""
+    """Measured streams of a simulated recording, and the true extrinsic."""
 
     parent: Trajectory
     child: Trajectory

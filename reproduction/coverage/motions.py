@@ -22,14 +22,14 @@ class Motion:
     poses: FloatArray
 
     def at(self, times_s: FloatArray) -> FloatArray:
-        """Poses (M, 4, 4) at times (M,), s: geodesics between the poses of the grid."""
+        """Return poses (M, 4, 4) at times (M,), s, interpolated between the poses of the grid."""
         rows = (np.asarray(times_s) + _MARGIN_S) * _RATE
         k = np.clip(rows.astype(int), 0, len(self.poses) - 2)
         share = rows - k
         return se3.interpolate(self.poses[k], self.poses[k + 1], share)
 
     def twists(self, times_s: FloatArray) -> FloatArray:
-        """Twists (M, 6) in the body's frame at times (M,): m/s and rad/s."""
+        """Return twists (M, 6) in the body's frame at times (M,), s: m/s and rad/s."""
         step_s = 1.0 / _RATE
         before = self.at(times_s - step_s)
         after = self.at(times_s + step_s)
@@ -102,7 +102,7 @@ def _from_euler(ypr: FloatArray, positions: FloatArray) -> FloatArray:
 
 
 def hand_held(rng: np.random.Generator, duration_s: float) -> Motion:
-    """A person waves a rig about all axes while walking slowly through a room."""
+    """Simulate a person who waves a rig about all axes while walking slowly through a room."""
     times = _grid(duration_s)
     walk_m = np.array([1.0, 1.0, 0.15])
     angle_sizes = np.array([0.5, 0.3, 0.3])
@@ -121,7 +121,10 @@ def _ground_vehicle(
     bank: FloatArray,
     bumps: FloatArray,
 ) -> Motion:
-    """A vehicle that moves along its own x axis; bumps (N, 3): extra roll, pitch (rad), heave."""
+    """Simulate a vehicle that moves along its x axis.
+
+    ``bumps`` (N, 3) are additional roll and pitch (rad) and heave (m).
+    """
     heading = np.cumsum(yaw_rate) / _RATE
     level = np.cos(slope)
     ahead = np.stack(
@@ -138,7 +141,7 @@ def _ground_vehicle(
 
 
 def car(rng: np.random.Generator, duration_s: float) -> Motion:
-    """A car on hilly roads: junctions and bends, slopes of some degrees.
+    """Simulate a car on hilly roads: junctions and bends, slopes of some degrees.
 
     The speed is about 9 m/s, with limits of 2 and 18 m/s.
     """
@@ -169,7 +172,7 @@ def car(rng: np.random.Generator, duration_s: float) -> Motion:
 def agv(
     rng: np.random.Generator, duration_s: float, ramps: bool = True
 ) -> Motion:
-    """An automated guided vehicle in a hall: turns, and ramps up and down of 3 or 6 degrees.
+    """Simulate an automated guided vehicle in a hall: turns, and ramps of 3 or 6 degrees.
 
     Without ``ramps`` the floor is flat and has no bumps.
     """
@@ -194,7 +197,7 @@ def agv(
 def _uniform_steps(
     rng: np.random.Generator, times: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
-    """Speed (N,) of an automated guided vehicle, m/s: uniform between limits."""
+    """Draw the speed (N,) of an automated guided vehicle, m/s: uniform between limits."""
 
     def speeds(size: int) -> FloatArray:
         return rng.uniform(*limits, size)
@@ -203,7 +206,7 @@ def _uniform_steps(
 
 
 def _turns_of_agv(rng: np.random.Generator, times: FloatArray) -> FloatArray:
-    """Yaw rate (N,) of an automated guided vehicle, rad/s."""
+    """Draw the yaw rate (N,) of an automated guided vehicle, rad/s."""
 
     def yaw_rates(size: int) -> FloatArray:
         return rng.normal(0.0, 0.35, size)
@@ -214,7 +217,10 @@ def _turns_of_agv(rng: np.random.Generator, times: FloatArray) -> FloatArray:
 def _bumps_of_agv(
     rng: np.random.Generator, times: FloatArray, slope: FloatArray
 ) -> FloatArray:
-    """Extra roll, pitch (rad) and heave (N, 3) on a slope (N,) (rad) that is not quite straight."""
+    """Draw additional roll and pitch (rad) and heave (m), (N, 3), of a vehicle on slopes (N,), rad.
+
+    The roll grows with the slope, because a ramp is not exactly straight.
+    """
     bumps = np.zeros((len(times), 3))
     bumps[:, :2] = np.radians(0.25) * _waves(rng, times, 2, (0.3, 1.0))
     bumps[:, 0] += slope * 0.25 * _wave(rng, times, (0.03, 0.1))
@@ -224,7 +230,7 @@ def _bumps_of_agv(
 def agv_on_request(
     rng: np.random.Generator, duration_s: float, flat_s: float = 0.0
 ) -> Motion:
-    """An automated guided vehicle that drives what the node asks for: curves, and a ramp at times.
+    """Simulate an automated guided vehicle that drives as the node asks: curves, and some ramps.
 
     A ramp of 7 deg takes 8 s, up and down in turn. Before ``flat_s``, there are no ramps.
     """
@@ -244,12 +250,12 @@ def agv_on_request(
 
 
 def flat_agv(rng: np.random.Generator, duration_s: float) -> Motion:
-    """An automated guided vehicle on a perfectly flat floor: the vertical offset stays unknown."""
+    """Simulate an automated guided vehicle on a flat floor: z of the extrinsic stays unknown."""
     return agv(rng, duration_s, ramps=False)
 
 
 def excavator(rng: np.random.Generator, duration_s: float) -> Motion:
-    """The cab of an excavator: it slews to and fro, rocks, and now and then drives a little."""
+    """Simulate the cab of an excavator, which slews to and fro, rocks, and sometimes drives."""
     times = _grid(duration_s)
 
     def slewing_rates(size: int) -> FloatArray:
@@ -280,7 +286,7 @@ def excavator(rng: np.random.Generator, duration_s: float) -> Motion:
 
 
 def drone(rng: np.random.Generator, duration_s: float) -> Motion:
-    """A multicopter: its tilt makes its acceleration, its yaw follows slowly."""
+    """Simulate a multicopter, which tilts to accelerate and yaws slowly."""
     times = _grid(duration_s)
     slow_m = np.array([3.0, 3.0, 0.7])
     fast_m = np.array([0.3, 0.3, 0.1])
@@ -297,7 +303,7 @@ def drone(rng: np.random.Generator, duration_s: float) -> Motion:
 
 
 def _thrust_directions(positions: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) of the thrust that moves a multicopter along positions (N, 3)."""
+    """Return the directions (N, 3) of the thrust of a multicopter along positions (N, 3)."""
     velocity = np.gradient(positions, axis=0)
     acceleration = np.gradient(velocity, axis=0) * _RATE**2
     acceleration = gaussian_filter1d(acceleration, 0.05 * _RATE, axis=0)
@@ -308,7 +314,7 @@ def _thrust_directions(positions: FloatArray) -> FloatArray:
 
 
 def arm(rng: np.random.Generator, duration_s: float) -> Motion:
-    """A robot arm: a camera goes from view to view of a target and stops at each."""
+    """Simulate the camera of a robot arm, which stops at each of several views of a target."""
     times = _grid(duration_s)
     view_s = 2.5
     n_views = int(np.ptp(times) / view_s) + 3

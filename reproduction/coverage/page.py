@@ -138,8 +138,9 @@ GOALS = (
 def page(rows: Sequence[Row], absent: Sequence[str], seeds: range) -> str:
     """Return the page in Markdown.
 
-    The table of known answers has a row for each recording, the table of levels a row for each
-    printed level, and the table of simulated recordings only the pooled row. ``--rows`` writes all.
+    The table of known answers has a row for each recording. The table of levels has a row for each
+    printed level. The table of simulated recordings has only the pooled row. ``--rows`` writes all
+    rows.
 
     Parameters
     ----------

@@ -145,9 +145,9 @@ def truth_cases(
 ) -> dict[str, dict[str, float]]:
     """Return the error of a result, and whether its intervals contain the true values.
 
-    Only axes that the truth and the motion determine are compared. ``covers`` is for intervals
-    without the common-mode floor, ``covers_floor`` for those with the floor, and ``covers_truth``
-    for those without the floor but with the uncertainty of the truth.
+    Only axes that the truth and the motion determine are compared. The intervals of ``covers`` are
+    without the common-mode floor, those of ``covers_floor`` with the floor. The intervals of
+    ``covers_truth`` are without the floor, but with the uncertainty of the truth.
     """
     is_comparable = np.isfinite(truth.sigmas) & _knows(result)
     error = deviation(result.T_parent_child, truth.T_parent_child)

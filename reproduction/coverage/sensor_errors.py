@@ -30,7 +30,7 @@ def _no_error() -> FloatArray:
 class GaussMarkov:
     """A stationary first-order process: correlation time (s) and standard deviations (6,).
 
-    Its axes are those of the sensor, or of the sensor's world if ``in_world`` is set.
+    The process is along and about the axes of the sensor, or of its world if ``in_world`` is set.
     """
 
     tau_s: float
@@ -51,7 +51,7 @@ class Tail:
     def draw(
         self, rng: np.random.Generator, count: int, dt: float
     ) -> FloatArray:
-        """Factors (N,)."""
+        """Draw factors (N,)."""
         if self.kind == "student":
             chi_squared = rng.chisquare(self.factor, count)
             return np.sqrt(self.factor / chi_squared)

@@ -136,9 +136,9 @@ def _check(arguments: Namespace) -> int:
 
 
 def _report(comparisons: Sequence[Comparison], baseline: Baseline) -> str:
-    failures = [
-        failure for comparison in comparisons for failure in comparison.failures
-    ]
+    failures: list[str] = []
+    for comparison in comparisons:
+        failures += comparison.failures
     table = markdown_table([comparison.row for comparison in comparisons])
     lines = [
         table,
@@ -182,11 +182,9 @@ def measure(
     seed: int, numbers: Mapping[str, int], folder: Path | None, jobs: int
 ) -> list[Score]:
     """Score simulated recordings, then real ones if there is a folder of them."""
-    draws = [
-        (family, seed, k)
-        for family, count in numbers.items()
-        for k in range(count)
-    ]
+    draws: list[tuple[str, int, int]] = []
+    for family, count in numbers.items():
+        draws += [(family, seed, number) for number in range(count)]
     scores = [*in_parallel(score_simulated, draws, jobs)]
     if folder is not None:
         cases = real_cases(folder, _PIECES, np.random.default_rng(seed))

@@ -1,8 +1,8 @@
 """Comparison of this version with another version of the package, on the same recordings.
 
-The table contains the ratio of the errors to those of the other version, the ratio to the
-Cramer-Rao bound of simulated recordings, NEES, and the coverage of the 90 % intervals with and
-without the common-mode floor.
+The table contains ratios of the errors: to the errors of the other version, and to the Cramer-Rao
+bound of simulated recordings. It also contains NEES, and the coverage of the 90 % intervals with
+and without the common-mode floor.
 """
 
 import os

@@ -20,8 +20,8 @@ _VERDICTS = ("USE", "USE WITH CARE", "DO NOT USE", "")
 # A family with fewer recordings has a row, but no limits of its own.
 _FEWEST_RECORDINGS = 8
 
-# This share of the family's median error is added in quadrature to errors before they are compared,
-# so that errors near zero by chance do not dominate the ratios.
+# Share of the family's median error that is added in quadrature to errors before a comparison.
+# Errors that are near zero by chance then do not dominate the ratios.
 _LUCK = 0.5
 
 # Largest difference of new recordings from the baseline, in standard errors. Chance exceeds it once
@@ -194,17 +194,20 @@ def _figures(scores: Sequence[Score]) -> dict[str, float]:
     ]
     nees = [score.nees for score in scores if score.nees is not None]
     over_robust = over_robust_least_squares(scores)
-    axes = sum(score.axes for score in scores) or np.nan
+    n_axes = sum(score.axes for score in scores) or np.nan
+    n_inside = sum(score.inside for score in scores)
+    n_with_allowance = sum(score.inside_allowance for score in scores)
+    n_without_answer = sum(not score.verdict for score in scores)
+    n_wrong = sum(score.is_wrong for score in scores)
     return {
         "error / bound": float(np.sqrt(_quantile(over_bound, 0.5) / MEDIAN_6)),
         "over robust": _quantile(over_robust, 0.5),
         "over robust, 90 %": _quantile(over_robust, 0.9),
-        "90 % covers": sum(score.inside for score in scores) / axes,
-        "with allowance": sum(score.inside_allowance for score in scores)
-        / axes,
+        "90 % covers": n_inside / n_axes,
+        "with allowance": n_with_allowance / n_axes,
         "NEES": _quantile(nees, 0.5),
-        "no answer": float(sum(not score.verdict for score in scores)),
-        "USE but wrong": float(sum(score.is_wrong for score in scores)),
+        "no answer": float(n_without_answer),
+        "USE but wrong": float(n_wrong),
     }
 
 
@@ -230,7 +233,7 @@ def over_robust_least_squares(scores: Sequence[Score]) -> list[float]:
 
 
 def error_ratio(now: Sequence[Score], before: Sequence[Score]) -> float:
-    """Geometric mean of errors over those of the same recordings in the baseline."""
+    """Return the geometric mean of the ratios of errors to the errors in the baseline."""
     logs: list[float] = []
     for family in dict.fromkeys(score.family for score in before):
         pairs = [

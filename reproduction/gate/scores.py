@@ -24,9 +24,9 @@ _UNITS = (1e3, 180.0 / np.pi)
 class Score:
     """Errors and intervals of the result of one recording.
 
-    ``errors`` are the errors of translation and rotation. They are divided by the bound for
-    simulated recordings, and in mm and deg for real recordings. They are empty if an axis of a
-    simulated recording is unobserved. ``robust_errors`` are the errors of robust least squares on
+    ``errors`` are the errors of translation and rotation: divided by the bound for simulated
+    recordings, in mm and deg for real recordings. The tuple is empty if an axis of a simulated
+    recording is unobserved. ``robust_errors`` are the errors of robust least squares on
     the same recording, in the same units. ``over_bound`` and ``nees`` are squared Mahalanobis
     distances of the errors (6 degrees of freedom), for the bound and for the measured covariance.
     ``axes`` is the number of compared axes, ``inside`` counts true values in measured 90 %

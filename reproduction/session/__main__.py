@@ -59,9 +59,9 @@ def _rigs(arguments: argparse.Namespace) -> list[Rig]:
 
 
 _ABOUT_RULES = (
-    "Other rules on the same simulated results. The columns have, for each target, the sessions "
-    "that ended, the share whose worst axis was within its target, the largest error as a "
-    "multiple of the target, and the median of the seconds beyond the earliest end:"
+    "Other rules on the same simulated results. The cells contain, for each target: the sessions "
+    "that ended; the share whose worst axis was within its target; the largest error as a "
+    "multiple of the target; the median of the seconds beyond the earliest end."
 )
 
 

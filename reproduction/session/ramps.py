@@ -31,7 +31,7 @@ from reproduction.session.stop import (
 )
 from reproduction.writing import markdown_table
 
-# Classes of the errors, in turn.
+# Classes of the sensors' errors; drives use them alternately.
 CLASSES_IN_TURN = ("agv_long", "agv_ramps")
 # Target in units of the default target: 4 cm and 0.6 deg.
 *_, FACTOR = FACTORS
@@ -151,21 +151,20 @@ def table(rows: Sequence[End]) -> str:
         done = [row for row in of_rule if np.isfinite(row.worst)]
         worst = np.array([row.worst for row in done])
         waits_s = np.array([row.wait_s for row in done])
+        waits = f"{np.median(waits_s):.0f}, {waits_s.max():.0f}"
         n_times = sum(row.n_times for row in done)
-        good = sum(row.n_good_times for row in done)
+        n_good_times = sum(row.n_good_times for row in done)
+        good = f"{n_good_times / n_times:.0%} of {n_times}" if n_times else "-"
+        change_s = sum(row.change_s for row in of_rule)
         lines.append(
             {
                 "rule": rule or "**of the node**",
                 "ended": f"{len(done)} of {len(of_rule)}",
                 "worst axis within target": f"{np.mean(worst <= 1.0):.0%}",
                 "largest error / target": f"{worst.max():.2f}",
-                "end after the last axis (s), median and largest": (
-                    f"{np.median(waits_s):.0f}, {waits_s.max():.0f}"
-                ),
-                "time left within a factor of two": (
-                    f"{good / n_times:.0%} of {n_times}" if n_times else "-"
-                ),
-                "change the motion (s)": f"{sum(row.change_s for row in of_rule):.0f}",
+                "end after the last axis (s), median and largest": waits,
+                "time left within a factor of two": good,
+                "change the motion (s)": f"{change_s:.0f}",
             }
         )
     return markdown_table(lines)

@@ -429,22 +429,27 @@ def rules_table(stops: Sequence[Stop]) -> str:
 
 
 def _row(kind: str, factor: float, stops: Sequence[Stop]) -> dict[str, object]:
+    """Return the row of sessions with a target: errors and times of those that ended."""
+    target_cm = 100 * factor * TARGET[0]
+    target_deg = np.degrees(factor * TARGET[3])
     done = [stop for stop in stops if stop.is_done]
-    worst = np.array([stop.worst for stop in done])
-    beyond = np.array([stop.seconds - stop.earliest_s for stop in done])
-    beyond = beyond[np.isfinite(beyond)]
+    within = "-"
+    largest = "-"
+    if done:
+        worst = np.array([stop.worst for stop in done])
+        within = f"{np.mean(worst <= 1.0):.0%}"
+        largest = f"{worst.max():.2f}"
+    beyond_s = np.array([stop.seconds - stop.earliest_s for stop in done])
+    beyond_s = beyond_s[np.isfinite(beyond_s)]
+    beyond = f"{np.median(beyond_s):.0f}" if len(beyond_s) else "-"
     return {
         "recordings": kind,
-        "target": f"{100 * factor * TARGET[0]:g} cm, {np.degrees(factor * TARGET[3]):.1f} deg",
+        "target": f"{target_cm:g} cm, {target_deg:.1f} deg",
         "number": len(stops),
         "told to stop": len(done),
-        "worst axis within target": f"{np.mean(worst <= 1.0):.0%}"
-        if done
-        else "-",
-        "largest error / target": f"{worst.max():.2f}" if done else "-",
-        "seconds beyond earliest": f"{np.median(beyond):.0f}"
-        if len(beyond)
-        else "-",
+        "worst axis within target": within,
+        "largest error / target": largest,
+        "seconds beyond earliest": beyond,
         "not getting there": sum(stop.is_stuck for stop in stops),
         "time left within a factor of two": _share_of_times(done),
     }

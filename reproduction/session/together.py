@@ -30,8 +30,8 @@ SIMULATED = ("hand_vio_walk", "agv_ramps", "drone_gnss_vio", "car_ins_lidar")
 _SECONDS = 90.0
 # Number of recordings of a rig.
 _RECORDINGS = 6
-# Scatter of the mount between recordings, per axis (m, rad). It is multiplied by a factor between
-# 1/2 and 2 that is drawn for each rig.
+# Scatter of the mount between recordings, per axis (m, rad). For each rig, the scatter is
+# multiplied by a random factor between 1/2 and 2.
 _SCATTER = np.repeat([0.008, np.radians(0.12)], 3)
 # Shift of the mount of the recording after a knock, in a random direction.
 _KNOCK_M = 0.05
