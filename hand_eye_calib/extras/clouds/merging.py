@@ -32,7 +32,7 @@ class Tuning:
     n_scans: int = 4
     # Longest time (s) from the first scan to the last scan. It is short because odometry drifts.
     longest_s: float = 30.0
-    # Angle (rad) between these scans that is sufficient.
+    # Sufficient rotation (rad) between the first and the last scan.
     sufficient_turn: float = np.pi / 2
     # Time (s) between compared poses. Each scan is then shifted by up to twice this time, to the
     # instant at which the sensor rotates most slowly.

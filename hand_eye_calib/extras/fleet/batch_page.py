@@ -1,7 +1,7 @@
 """``index.html`` of a batch.
 
-The page contains the common result of each vehicle with a figure of each axis over time, and a row
-for each recording with a link to its report.
+The page contains the common result of each vehicle, with a figure of each axis over time. It also
+has a row for each recording, with a link to the report of the recording.
 """
 
 from collections import Counter

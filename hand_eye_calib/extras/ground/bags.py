@@ -96,11 +96,11 @@ def vertical_topics(bag: PoseBag) -> dict[str, tuple[str, str]]:
 
     Topics with clouds are first. Topics of a type are sorted by their numbers of messages.
     """
-    found: dict[str, tuple[str, str]] = {}
+    topics: dict[str, tuple[str, str]] = {}
     for message_type, quantity in _QUANTITIES.items():
         for topic, frame in topics_and_frames(bag, message_type):
-            found[topic] = quantity, frame
-    return found
+            topics[topic] = quantity, frame
+    return topics
 
 
 def _topic_of(names: StreamFrames, topics_of: Mapping[str, str]) -> str:

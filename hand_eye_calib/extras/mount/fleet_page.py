@@ -32,7 +32,8 @@ _HEIGHT = 3.9
 # Largest number of vehicles with a figure. All vehicles are in the table.
 _MAX_FIGURES = 12
 
-# An axis is drawn if its standard deviation is below this share of that of an unknown offset.
+# An axis is drawn if its standard deviation is below this share of the standard deviation of an
+# unknown offset.
 _DETERMINED = 0.3
 
 _CAPTION = (
@@ -111,9 +112,9 @@ def _row(name: str, history: History) -> _Row:
 
 
 def _precision(history: History) -> list[tuple[str, str, str]]:
-    """Return, per axis, the standard deviation of the offset after the first and the last session.
+    """Return the standard deviation of the offset after the first and the last session, per axis.
 
-    These are sessions since the last change or alarm.
+    Only sessions since the last change or alarm count.
     """
     first = history.offsets[max(history.cuts, default=0)]
     last = history.offsets[-1]

@@ -218,7 +218,7 @@ def find_changes(digests: Sequence[Digest]) -> list[Changepoint]:
 def _evidence_on_common_offset(digest: Digest) -> FloatArray:
     """Return the evidence ``[H S]`` (6, 7) of a session on d, the offset common to all sessions.
 
-    It is weaker than the evidence in the digest, because the session also has its own error u_k.
+    This evidence is weaker than the evidence in the digest, because of the error u_k.
     """
     return shift_evidence(digest.evidence, np.zeros(6), digest.wander)
 

@@ -55,7 +55,7 @@ _OF_ROTATIONS: dict[str, tuple[object, ...]] = {
 # positions estimates a smaller change better than speeds do.
 _LEAST_CHANGE_OF_POSITIONS_S = 0.05
 
-# Largest time offset (s) that the solve can certainly estimate on its own.
+# Largest time offset (s) that the solve can certainly estimate without a correlation of rates.
 _FOUND_BY_SOLVE_S = 0.25
 
 # Standard deviation of a time offset from correlated rates, as a multiple of the interval between
@@ -130,7 +130,7 @@ def _offset_of_paths(snapshot: Snapshot) -> float:
 
 def _is_unrelated(calibration: Calibration) -> bool:
     """Return whether the streams of a result are unrelated, according to its findings."""
-    return any(found.code == "unrelated" for found in calibration.findings)
+    return _has(calibration.findings, "unrelated")
 
 
 def _solve_rotations(

@@ -62,8 +62,8 @@ _LIKELY_SIGMAS = 3.3
 _SMOOTHING_S2 = 0.008
 # Smallest reported delay (s) of a coordinate after the others.
 _LAG_S = 0.02
-# If the positions are on another path than the poses, a fault is reported as the cause only if the
-# faults explain at least this share of the squared residuals.
+# If positions and poses are on different paths, a fault is reported as the cause only above this
+# share of the squared residuals that the faults explain.
 _MIN_EXPLAINED_SHARE = 0.6
 
 # A path is mirrored if a lever arm leaves less than this share of the path unexplained after the

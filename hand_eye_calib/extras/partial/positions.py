@@ -504,7 +504,10 @@ def _solution(
 
 
 def _solved(products: FloatArray) -> FloatArray:
-    """Products (..., 9, 9) of the lever arm, the parameters solved with it, and the residuals."""
+    """Return the products (..., 9, 9) without the row and column of the response.
+
+    The rows are the lever arm, the parameters that are estimated with it, and the residuals.
+    """
     response = 3 + len(_SHARED)
     return np.delete(np.delete(products, response, axis=-2), response, axis=-1)
 

@@ -64,7 +64,7 @@ _MIRRORED = 0.5
 # the other axes.
 _UNMIRRORED = 0.06
 # Duration (s) of the motions with these rotation vectors. Only short rotation vectors are mirrored
-# as rates are. Those of motions of 1 s are too long.
+# as rates are. Rotation vectors of motions of 1 s are too long.
 _MIRRORED_S = 0.5
 
 # Orientations are inverted only if the inversion leaves at most this share of the rotation

@@ -500,9 +500,9 @@ class RigCalibration:
     def covariance(self, first: str, second: str) -> FloatArray:
         """Return the covariance (6, 6) of xi = (rho, phi) in ``T(first, second) @ Exp(xi)``.
 
-        The covariance (m, rad) includes the allowance. It is that of the result for these two
-        sensors. Two sensors without such a result get the sum of their covariances relative to the
-        first sensor of the rig. This sum contains the errors of the first sensor twice.
+        The covariance (m, rad) includes the allowance. If there is a result for these two sensors,
+        the covariance is from this result. Otherwise, it is the sum of the covariances of both
+        sensors relative to the first sensor, and contains the errors of the first sensor twice.
         """
         return self._covariance(first, second, with_allowance=True)
 

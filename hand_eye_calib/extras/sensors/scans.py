@@ -10,9 +10,9 @@ the pose that continues the last motion. It is registered finely after the next 
 poses before and after it. The poses then determine the motion during the scan. A constant motion in
 its place would double the errors.
 
-The range error of each ring is estimated from the planes of the map. If it is ignored, an error of
-3 mm makes walls move as the lidar pitches, and the extrinsic is up to 2 cm off along the axis with
-the least rotation.
+The range error of each ring is estimated from the planes of the map. Without this correction, an
+error of 3 mm makes walls move as the lidar pitches. The extrinsic is then up to 2 cm off, along the
+axis with the least rotation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -153,10 +153,10 @@ def scan_of(message: Any) -> Scan:
 class ScanReading(Reading):
     """Compute odometry from the points of a lidar: each scan is registered after the previous one.
 
-    The result is stored beside the bag, and read again for files of the same sizes and times. It
-    has ``poses`` (N, 7) of the middles of scans in the frame of the first scan, ``stamps_ns`` and
-    ``bag_ns`` (N,), the lidar's ``frame``, the number of scans without registration, ``n_failed``,
-    and the range error of each ring, ``too_far_m``.
+    The result is stored beside the bag, and read again for files of the same sizes and times. Its
+    ``poses`` (N, 7) are at the middles of the scans, in the frame of the first scan. ``stamps_ns``
+    and ``bag_ns`` (N,) are their times. ``frame`` is the lidar's frame, ``n_failed`` the number of
+    scans without registration, and ``too_far_m`` the range error of each ring.
 
     Raises
     ------

@@ -60,7 +60,7 @@ _MIN_IDENTITY = 0.001
 # Poses of an arm may be inverse if the sensor or target on the hand is farther from the hand than
 # this (m) ...
 _MAX_ON_HAND_M = 0.3
-# ... and the other one is nearer to the base than this share of that distance.
+# ... and the other object is nearer to the base than this share of the distance to the hand.
 _MAX_BASE_RATIO = 0.5
 
 # An unobservable direction, a unit vector of translation and rotation, counts as a rotation if its

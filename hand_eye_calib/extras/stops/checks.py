@@ -67,7 +67,7 @@ _CONTRADICTING_SHARE = 0.08
 # differ by at least 95 with four or more stops, and by 0.0 with three.
 MIN_LEAD = 7.0
 
-# Largest number of hypotheses that are solved in full. They are those with the best rough fits.
+# Largest number of hypotheses that are solved in full: those with the best rough fits.
 _MAX_RIVALS = 6
 
 # Largest spread (m) of an arm's positions. If it is larger, the unit is not metres.

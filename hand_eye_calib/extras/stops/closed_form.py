@@ -97,7 +97,7 @@ def _closed_form(stops: Stops) -> tuple[FloatArray, FloatArray]:
 
 
 def starts_of(stops: Stops) -> list[tuple[FloatArray, FloatArray]]:
-    """Return X and Z (4, 4) from the closed form of all stops, and from that of a few stops.
+    """Return X and Z (4, 4) from the closed forms of all stops and of a few stops.
 
     The few stops are the random subset with the smallest errors of the other stops. If the closed
     form of all stops is better, it is the only start.

@@ -1,7 +1,11 @@
 """Command ``calibrate`` for stops.
 
-Input is a file with the samples of an arm, two files whose rows belong together, or poses of a hand
-(a file, or a folder with a file for each pose) and a folder with images of a target.
+The input is one of:
+
+- a file with the samples of an arm,
+- two files whose rows belong together,
+- poses of a hand (a file, or a folder with a file for each pose), and a folder with images of a
+  target.
 """
 
 from argparse import Namespace
@@ -263,7 +267,8 @@ def _refuse_ignored(arguments: Namespace) -> None:
     if len(arguments.paths) == 1:
         names += [*FILE_OPTIONS, "pair_by"]
         of_streams += FILE_OPTIONS
-    names += [f"{stream}_{name}" for stream in STREAMS for name in of_streams]
+    for stream in STREAMS:
+        names += [f"{stream}_{name}" for name in of_streams]
     for name in names:
         if getattr(arguments, name, None):
             raise ConfigError(

@@ -213,11 +213,10 @@ def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
 
     ``rests`` (N,) are the weights of stops at one place, with 0 for outliers.
     """
-    fits = [
-        _fit_without_outliers(stops, start, in_world, rests)
-        for start in starts_of(stops)
-        for in_world in (False, True)
-    ]
+    fits = []
+    for start in starts_of(stops):
+        for in_world in (False, True):
+            fits.append(_fit_without_outliers(stops, start, in_world, rests))
     return min(fits, key=lambda fit: fit.objective)
 
 

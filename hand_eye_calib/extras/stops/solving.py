@@ -24,10 +24,10 @@ from hand_eye_calib.extras.stops.rough_fit import (
 )
 from hand_eye_calib.extras.stops.worlds import SETUPS
 
-# The scale of the child's lengths is not 1 if it differs from 1 by more than this number of
-# standard deviations, and by more than the next limit.
+# The scale of the child's lengths counts as different from 1 if the difference exceeds this number
+# of standard deviations ...
 _MIN_SCALE_SIGMAS = 3.0
-# The scale must also differ from 1 by more than this.
+# ... and this limit.
 _MIN_SCALE_CHANGE = 0.01
 
 # Largest factor between assumed and true size of a target. A larger scale has another cause.
@@ -99,7 +99,6 @@ class _Repaired:
     Attributes
     ----------
     poses : StopPoses
-    poses : StopPoses
         Poses in the usual convention and in metres.
     config : CalibratorConfig
         Options of the user, together with the options of the repairs.
@@ -122,17 +121,17 @@ class _Repaired:
 def inversions_in_words(config: CalibratorConfig) -> str:
     """Return the options for inverse poses of an arm that the user can still set, in words."""
     sides = {"parent_invert": "robot", "child_invert": "target"}
-    given = [name for name in sides if getattr(config, name) == "poses"]
+    inverted = [name for name in sides if getattr(config, name) == "poses"]
     others = [
         f"{name} poses ({side})"
         for name, side in sides.items()
-        if name not in given
+        if name not in inverted
     ]
-    if not given:
+    if not inverted:
         return f"give {', '.join(others)}, or both"
     if not others:
-        return f"leave {' or '.join(given)} out, or both"
-    return f"leave {given[0]} out, or give {others[0]} as well"
+        return f"leave {' or '.join(inverted)} out, or both"
+    return f"leave {inverted[0]} out, or give {others[0]} as well"
 
 
 def solve_checked(

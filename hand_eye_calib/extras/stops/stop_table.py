@@ -15,7 +15,7 @@ from hand_eye_calib.extras.stops.next_stops import NextStop
 
 @dataclass(frozen=True)
 class Stop:
-    """One row of the table.
+    """A stop, as a row of the table.
 
     Attributes
     ----------

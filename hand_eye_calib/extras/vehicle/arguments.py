@@ -19,7 +19,7 @@ class NominalAction(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Put the sizes before all other options, of which the last counts."""
+        """Insert the sizes before all other options. Of equal options, the last one counts."""
         # The reader imports NumPy, which the help of a command does not need.
         from hand_eye_calib.extras.vehicle.nominal import nominal_sizes
 

@@ -9,9 +9,9 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.extras.vehicle.wheels import WheelModel, motions
 
-# Indices of some of the U unknowns. Order of the unknowns: the pose of the sensor (x, y in m;
-# rotations about the axes x, y, z of the axle in rad), the clock offset (s), the slip angle per
-# lateral acceleration (rad s^2/m), and the parameters of the wheels.
+# Indices of some of the U unknowns. Unknowns 0 to 4 are the pose of the sensor: x, y (m), and
+# rotations about the axes x, y, z of the axle (rad). Then follow the clock offset (s), the slip
+# angle per lateral acceleration (rad s^2/m), and the parameters of the wheels.
 Y = 1
 
 TILT = (2, 3)

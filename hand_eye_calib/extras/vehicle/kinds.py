@@ -476,9 +476,9 @@ def _is_upside_down(fit: Fit) -> bool:
     """Return whether z of the sensor, or -y of a camera, points down."""
     up = se3.rotation_of(fit.T_base_sensor)[2]
     main = int(np.argmax(np.abs(up)))
-    return bool(
-        up[2] < 0.0 if main == 2 else up[1] > 0.0 if main == 1 else False
-    )
+    if main == 2:
+        return bool(up[2] < 0.0)
+    return main == 1 and bool(up[1] > 0.0)
 
 
 def _has_varied_turns(drive: Drive) -> bool:

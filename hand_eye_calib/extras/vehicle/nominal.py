@@ -50,9 +50,9 @@ def nominal_sizes(path: str | Path) -> dict[str, float]:
         If the file cannot be read, has no such size, or has several different ones.
     """
     is_xml = read_bytes(path).lstrip().startswith(b"<")
-    found = _of_urdf(path) if is_xml else _of_controllers(path)
+    values_of_options = _of_urdf(path) if is_xml else _of_controllers(path)
     sizes = {}
-    for option, values in found.items():
+    for option, values in values_of_options.items():
         different = sorted({round(value, _DECIMALS) for value in values})
         if len(different) > 1:
             name = option.removeprefix("nominal_")
@@ -73,16 +73,13 @@ def nominal_sizes(path: str | Path) -> dict[str, float]:
 
 def _of_controllers(path: str | Path) -> dict[str, list[float]]:
     """Return the values of each size in the parameters of controllers."""
-    mappings = [*_mappings(read_yaml(path, "parameters of a controller"))]
-    return {
-        option: [
-            float(mapping[name])
-            for mapping in mappings
-            for name in names
-            if _is_length(mapping.get(name))
-        ]
-        for option, names in _PARAMETERS.items()
-    }
+    values: dict[str, list[float]] = {option: [] for option in _PARAMETERS}
+    for mapping in _mappings(read_yaml(path, "parameters of a controller")):
+        for option, names in _PARAMETERS.items():
+            for name in names:
+                if _is_length(mapping.get(name)):
+                    values[option].append(float(mapping[name]))
+    return values
 
 
 def _is_length(value: Any) -> bool:

@@ -86,8 +86,9 @@ _PARTS = 10
 # probability.
 _TAIL = 0.01
 
-# Standard deviation by longer windows, as a share of the difference between the estimates. It is
-# the slope of the regression of the errors on this difference, in 470 simulated drives.
+# A second estimate uses longer windows. This share of the difference between both estimates is an
+# additional standard deviation. The share is the slope of the regression of the errors on this
+# difference, in 470 simulated drives.
 _SHARE_OF_LONGER = 0.5
 # The same share for the difference from the estimate without weights.
 _SHARE_OF_UNWEIGHTED = 0.15
@@ -161,8 +162,8 @@ class Fit:
     def signal_to_noise(self, components: Sequence[int]) -> dict[str, float]:
         """Return the information on x, y and yaw as a multiple of the information in noise.
 
-        Noise of the turns looks like turns of the vehicle. It makes x and y too small, by the
-        inverse of this multiple. ``components`` are those of the drive.
+        Noise of the turns looks like turns of the vehicle. This noise makes x and y too small, by
+        the inverse of the multiple. ``components`` are those of the drive.
         """
         variances = dict(
             zip(components, np.diag(self.noise).tolist(), strict=True)
