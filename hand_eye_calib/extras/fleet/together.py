@@ -344,12 +344,15 @@ def _joint(
     most_frequent_method, _ = methods.most_common(1)[0]
     clocks = {(result.time_offset_s, result.scale) for result in used}
     offset_s, scale = clocks.pop() if len(clocks) == 1 else (0.0, 1.0)
+    allowances = [result.covariance_allowance for result in used]
+    counts = {
+        name: sum(getattr(result, name) for result in used) for name in _COUNTS
+    }
+    of_newest = {name: getattr(newest, name) for name in _OF_NEWEST}
     return Calibration(
         T_parent_child=agreement.T_parent_child,
         covariance_measured=assessed.cov_parent_child_in_child,
-        covariance_allowance=np.mean(
-            [result.covariance_allowance for result in used], axis=0
-        ),
+        covariance_allowance=np.mean(allowances, axis=0),
         observability_measured=assessed.observability,
         status=SolveStatus.UNOBSERVABLE if is_open else SolveStatus.OK,
         objective=agreement.chi2,
@@ -359,11 +362,8 @@ def _joint(
         findings=_gravest_of_each(used),
         warnings=_warnings_of(recordings),
         parts={"together": record},
-        **{
-            name: sum(getattr(result, name) for result in used)
-            for name in _COUNTS
-        },
-        **{name: getattr(newest, name) for name in _OF_NEWEST},
+        **counts,
+        **of_newest,
     )
 
 

@@ -129,18 +129,19 @@ class MountWatch:
             if axes:
                 text += f"; {axes_in_words(axes)} cannot be monitored with this motion"
         visible = np.where(visible < change.UNKNOWN_FROM, visible, np.nan)
-        shift = alarm.shift.axes if alarm else {}
+        shift = {}
+        shift_sigma = {}
+        if alarm:
+            for axis, row in alarm.shift.axes.items():
+                shift[AXIS_KEYS[axis]] = row.difference
+                shift_sigma[AXIS_KEYS[axis]] = row.sigma
         return MountState(
             level=Level.ERROR if alarm else Level.OK,
             text=text,
             is_learning=monitor.is_learning,
             seconds_of_motion=monitor.seconds,
-            shift={
-                AXIS_KEYS[axis]: row.difference for axis, row in shift.items()
-            },
-            shift_sigma={
-                AXIS_KEYS[axis]: row.sigma for axis, row in shift.items()
-            },
+            shift=shift,
+            shift_sigma=shift_sigma,
             visible_10min=by_axis(visible),
             since_ns=alarm.since_ns if alarm else None,
             newest_ns=self._last_ns,

@@ -213,15 +213,15 @@ def fit_positions(
         np.diag(np.linalg.inv(fitted.blocks.total[:-1, :-1]))
     )
     weight = fitted.weights @ is_used.sum(axis=1)
+    distances_m = _root_mean_square(windows.path, is_used)
+    accelerations = _root_mean_square(windows.accelerations, is_used)
     return PositionFit(
         **vars(fitted),
         is_constant=np.ptp(positions, axis=0) < _MAX_CONSTANT_M,
-        path_m=float(np.linalg.norm(_root_mean_square(windows.path, is_used))),
+        path_m=float(np.linalg.norm(distances_m)),
         spreads_m=np.sqrt(information[fitted.places["scales"]] / weight),
         speeds_m_s=_root_mean_square(windows.velocities, is_used),
-        acceleration_m_s2=float(
-            np.linalg.norm(_root_mean_square(windows.accelerations, is_used))
-        ),
+        acceleration_m_s2=float(np.linalg.norm(accelerations)),
     )
 
 

@@ -475,14 +475,13 @@ def _solution(
     ]
     # An error that is correlated over a part of the recording may also have a part that is constant
     # over the whole recording. X absorbs the constant part, so the variance of the error is added.
-    lasting = (
-        float(np.exp(state.levels[N_FAST])) if state.model.processes else 0.0
-    )
+    lasting = 0.0
+    if state.model.processes:
+        lasting = float(np.exp(state.levels[N_FAST]))
+    of_lever_arm = covariance[:3, :3] + np.outer(shift, shift)
     return LeverArmSolution(
         lever_arm=se3.translation_of(state.X) + normal.step[:3],
-        covariance=covariance[:3, :3]
-        + np.outer(shift, shift)
-        + lasting * np.eye(3),
+        covariance=of_lever_arm + lasting * np.eye(3),
         by_response=_by_response(posterior.products),
         parameters=parameters,
         parameter_sigmas=sigmas,

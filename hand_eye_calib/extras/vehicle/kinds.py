@@ -257,6 +257,9 @@ def _calibration(
     if any(item.makes_unusable for item in findings):
         unknown_axes = AXES
     fused = fuse(_assessed(fit, unknown_axes), config.prior())
+    clock_sigma_s = 0.0
+    if not _is_clock_fixed(drive, config):
+        clock_sigma_s = float(np.sqrt(fit.covariance[CLOCK, CLOCK]))
     result = estimation.calibration_of(
         fit,
         fused,
@@ -268,9 +271,7 @@ def _calibration(
         T_method=fit.T_base_sensor,
         covariance_allowance=fused.allowance(_allowance(pairs, config)),
         time_offset_s=offset_s + float(fit.others[0]),
-        time_offset_sigma_s=0.0
-        if _is_clock_fixed(drive, config)
-        else float(np.sqrt(fit.covariance[CLOCK, CLOCK])),
+        time_offset_sigma_s=clock_sigma_s,
         findings=findings,
     )
     if drive.model is None or unknown_axes == AXES:
