@@ -21,6 +21,7 @@ from sigmas import assert_nees, nees
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.assessment.covariance import assess_adaptive
+from hand_eye_calib.core.assessment.noise_words import noise_in_words
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
 from hand_eye_calib.core.noise import estimator, fit, increments, partwise
@@ -338,7 +339,7 @@ def test_the_right_systematic_error_is_chosen_and_measured(nuisance):
 def test_a_lag_is_measured_and_stated(seed):
     _, solution = noisy_and_solved("time", seed)
     assert solution.time_offset_s == pytest.approx(-0.02, abs=1e-3)
-    words = " ".join(solution.describe(stamps(300)).in_words)
+    words = " ".join(noise_in_words(solution, stamps(300)).in_words)
     assert re.search(
         r"the child's stamps are (19|20|21)\.\d \+/- 0\.\d+ ms late", words
     )
@@ -396,7 +397,7 @@ def test_poses_wrong_by_themselves_are_bridged():
     assert_allclose(
         solution.T_parent_child, undisturbed.T_parent_child, atol=2e-3
     )
-    description = solution.describe(stamps(150))
+    description = noise_in_words(solution, stamps(150))
     words = " ".join(description.in_words)
     assert (
         "5 outlier poses, left out, at 2.000, 4.100, 4.200, 8.000, 12.000 s"

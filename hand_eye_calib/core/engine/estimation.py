@@ -15,6 +15,7 @@ from hand_eye_calib.core.alignment.similarity import SimilarityFit
 from hand_eye_calib.core.alignment.time_offset import TimeOffset
 from hand_eye_calib.core.assessment import common_mode, covariance
 from hand_eye_calib.core.assessment.moved import possible_shift
+from hand_eye_calib.core.assessment.noise_words import noise_in_words
 from hand_eye_calib.core.assessment.prior import fuse, widened
 from hand_eye_calib.core.assessment.rocking import rocking_axis
 from hand_eye_calib.core.assessment.second_opinion import (
@@ -139,7 +140,8 @@ class Solved:
             )
         noise = None
         if isinstance(solution, AdaptiveSolution):
-            noise = solution.describe(
+            noise = noise_in_words(
+                solution,
                 self.stamps_ns,
                 self.time_offset.seconds if self.time_offset else None,
                 self.scale if self.scale_fit else None,

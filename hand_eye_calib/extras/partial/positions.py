@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hand_eye_calib.core.assessment.noise_words import events
 from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
@@ -115,7 +116,7 @@ class LeverArmSolution(ModelSolution):
                 f"acceleration shifts the positions by {response_mm:.1f} +/- {sigma_mm:.1g} mm per "
                 "m/s^2 (one of the sensors smooths); the +/- values contain the effect of this"
             )
-        sentences += self.events(stamps_ns)
+        sentences += events(self, stamps_ns)
         return Noise(
             translation_white_m=sigmas.translation_m,
             translation_drift_m_per_pose=sigmas.walk_translation_m,
