@@ -34,6 +34,7 @@ from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.trajectory import Columns
 from hand_eye_calib.core.noise.normal import transposed
+from hand_eye_calib.core.noise.partwise import MAX_POSES
 from hand_eye_calib.core.pairing.motion_pairs import motions
 
 # Indices of the parameters of each systematic error:
@@ -53,9 +54,6 @@ SYSTEMATIC_OF_RATES = ("time", "rate")
 
 # Parts of the child's step that may drift: its length (scale) and its direction.
 PATH_PARTS = ("scale", "direction")
-
-# Largest number of increments whose first residuals are computed at once. It limits the memory.
-_BATCH = 10_000
 
 # Lower bound of the median square (m^2) of the differences between steps and their neighbours. A
 # smaller value is rounding.
@@ -288,8 +286,9 @@ def first_residuals(
 ) -> FloatArray:
     """Return the residuals e (n, 6) of :func:`linearise` without systematic errors."""
     residuals = []
-    for start in range(0, len(streams) - 1, _BATCH):
-        poses = slice(start, start + _BATCH + 1)
+    # Batches limit the memory.
+    for start in range(0, len(streams) - 1, MAX_POSES):
+        poses = slice(start, start + MAX_POSES + 1)
         parameters = np.zeros(N_SYSTEMATIC)
         part = linearise(
             streams[poses], course[poses], T_parent_child, parameters, []

@@ -33,6 +33,7 @@ from hand_eye_calib.core.noise.increments import (
     Streams,
     first_residuals,
 )
+from hand_eye_calib.core.noise.noise_model import MIN_VARIANCE
 from hand_eye_calib.core.noise.normal import transposed
 from hand_eye_calib.core.noise.partwise import PartwisePosterior
 from hand_eye_calib.core.noise.state_space import (
@@ -42,15 +43,9 @@ from hand_eye_calib.core.noise.state_space import (
 )
 from hand_eye_calib.core.noise.tuning import Tuning
 
-# A smaller residual (m, rad) is rounding, not a jump.
-_MIN_JUMP = 1e-6
-
 # The diagonal of S - S_post is increased by this share of the diagonal of S. Rounding could
 # otherwise make the matrix indefinite.
 _INCREASE_SHARE = 1e-9
-# The diagonal is also increased by this variance (m^2, rad^2): S may be singular for positions or
-# rotations alone.
-_INCREASE_VARIANCE = 1e-18
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,8 @@ def first_outliers(
     lengths = _lengths(residuals)
     usual_lengths = np.array([median(column) for column in lengths.T])
     limits = np.maximum(
-        tuning.first_jump_sigmas * usual_lengths / MEDIAN_LENGTH, _MIN_JUMP
+        tuning.first_jump_sigmas * usual_lengths / MEDIAN_LENGTH,
+        np.sqrt(MIN_VARIANCE),
     )
     is_large: BoolArray = np.asarray((lengths > limits).any(axis=1))
     spikes = np.r_[False, is_large[1:] & is_large[:-1], False]
@@ -190,9 +186,9 @@ def chi_squares(
     """
     covariances = prior - posterior
     covariances[is_unused] = prior[is_unused] + posterior[is_unused]
-    # Increase the diagonal only: the prior of jitter is singular, because jitter acts along one
-    # velocity.
-    covariances += (_INCREASE_SHARE * prior + _INCREASE_VARIANCE) * np.eye(6)
+    # Increase the diagonal only. The prior of jitter is singular, because jitter acts along one
+    # velocity. The prior of positions or rotations alone is singular, too.
+    covariances += (_INCREASE_SHARE * prior + MIN_VARIANCE) * np.eye(6)
     weighted = np.linalg.solve(covariances, values[:, :, None])[:, :, 0]
     return np.asarray((values * weighted).sum(axis=1))
 

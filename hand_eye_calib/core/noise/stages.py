@@ -39,6 +39,7 @@ from hand_eye_calib.core.noise.increments import (
 )
 from hand_eye_calib.core.noise.noise_model import (
     CENTRES,
+    MIN_VARIANCE,
     N_FAST,
     PROCESSES,
     VARIANCES,
@@ -66,9 +67,6 @@ from hand_eye_calib.core.solvers.registry import Method
 # Newton steps in the search for time-correlated errors, before processes without information are
 # dropped for the first time.
 _FIRST_STEPS = 4
-
-# A shorter step of X (m, rad) is rounding.
-_ROUNDING_STEP = 1e-9
 
 
 def sample(n_poses: int, tuning: Tuning) -> IntArray | None:
@@ -434,7 +432,7 @@ def is_settled(workspace: Workspace, fit: Fit) -> bool:
     variances[:3], axes = np.linalg.eigh(normal.covariance[:3, :3])
     steps[:3] = axes.T @ normal.step[:3]
     sigmas = np.sqrt(np.maximum(variances, 0.0))
-    limits = np.maximum(tuning.settled_sigmas * sigmas, _ROUNDING_STEP)
+    limits = np.maximum(tuning.settled_sigmas * sigmas, np.sqrt(MIN_VARIANCE))
     limits[:3][sigmas[:3] > tuning.unknown_m] = np.inf
     return bool((np.abs(steps) < limits).all())
 
