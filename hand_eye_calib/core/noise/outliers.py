@@ -75,12 +75,12 @@ class Outliers:
             jumps | (np.diff(kept) > longest_gap), self.spikes[kept]
         )
 
-    def differs_by(self, other: Outliers) -> float:
-        """Return the share of poses whose jump or spike is in only one of both sets."""
-        differing = np.sum(self.jumps != other.jumps) + np.sum(
-            self.spikes != other.spikes
+    def differs_from(self, other: Outliers) -> bool:
+        """Return whether a jump or an outlier pose is in only one of both sets."""
+        return not (
+            np.array_equal(self.jumps, other.jumps)
+            and np.array_equal(self.spikes, other.spikes)
         )
-        return float(differing) / len(self.spikes)
 
 
 def first_outliers(

@@ -162,7 +162,7 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
     problem = workspace.problem
     tuning = problem.tuning
     detected = _detect_in_rounds(workspace, fit, tuning.max_rounds)
-    if detected.outliers.differs_by(fit.outliers) > tuning.negligible_share:
+    if detected.outliers.differs_from(fit.outliers):
         detected = _detect_in_rounds(workspace, noise(workspace, detected), 1)
     spikes = detected.outliers.spikes
     if np.mean(spikes) > tuning.max_outlier_share:
@@ -181,7 +181,7 @@ def outliers(workspace: Workspace, fit: Fit) -> Fit:
 def _detect_in_rounds(
     workspace: Workspace, fit: Fit, rounds: int, with_spikes: bool = True
 ) -> Fit:
-    """Detect jumps and outlier poses until few of them change, at most ``rounds`` times.
+    """Detect jumps and outlier poses until none of them changes, at most ``rounds`` times.
 
     Without spikes, only jumps are detected: in this case outlier poses have small weights.
     """
@@ -198,17 +198,14 @@ def _detect_in_rounds(
         detected = detect_outliers(
             fit.outliers, of_walk, of_white, tuning, with_spikes
         )
-        change = detected.differs_by(fit.outliers)
-        if change:
-            poses = bridge_outliers(problem.streams, fit.T, detected.spikes)
-            fit = replace(
-                fit,
-                outliers=detected,
-                poses=poses,
-                error=np.zeros_like(fit.error),
-            )
-        if change <= tuning.negligible_share:
+        if not detected.differs_from(fit.outliers):
             break
+        fit = replace(
+            fit,
+            outliers=detected,
+            poses=bridge_outliers(problem.streams, fit.T, detected.spikes),
+            error=np.zeros_like(fit.error),
+        )
     if with_spikes:
         of_sound = of_white[~fit.outliers.spikes]
         is_heavy = (

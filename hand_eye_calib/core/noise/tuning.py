@@ -63,9 +63,6 @@ class Tuning:
     # get Student weights in the stage `tails`. At the first detection, before noise levels are
     # known, all large residuals are then jumps.
     max_outlier_share: float = 0.2
-    # The noise levels are fitted again if the outliers and jumps have changed at more than this
-    # share of the poses and increments.
-    negligible_share: float = 0.005
 
     # -- Rotation noise that is large relative to the rotation between poses --
     # Poses are noisy if their rotation noise exceeds this share of the rotation between poses.
