@@ -39,7 +39,7 @@ from hand_eye_calib.core.noise.normal import NormalEquations, multiplied
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs, PosePairs
 from hand_eye_calib.core.results.calibration import DofObservability, DofVerdict
 from hand_eye_calib.core.results.records import AXES, ROTATIONS
-from hand_eye_calib.core.solvers.all_pairs import Solution
+from hand_eye_calib.core.solvers.all_pairs import RANK_TOLERANCE, Solution
 
 # Number of blocks for the jackknife.
 BLOCKS = 10
@@ -59,9 +59,6 @@ UNKNOWN_SIGMAS = np.repeat([3.0, np.pi], 3)
 
 # Smallest divisor among variances (m^2 or rad^2). The variance of noise-free data is zero.
 ROUNDING_VARIANCE = 1e-24
-
-# Information below this share of the largest information is rounding.
-_RANK_TOLERANCE = 1e-12
 
 # The motion reveals a direction of the lever arm if its mean square displacement exceeds that by
 # rotation errors by this factor. Noise alone causes smaller ratios.
@@ -462,7 +459,7 @@ def model_covariance(
     hessian = information_t + 2 * information_r
     values, vectors = np.linalg.eigh(hessian)
     rounding = max(
-        _RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2
+        RANK_TOLERANCE * values[-1], weights.sum() * _ROUNDING_ANGLE**2
     )
     is_seen = values > rounding
     inverse_values = np.divide(1.0, values, out=np.zeros(6), where=is_seen)

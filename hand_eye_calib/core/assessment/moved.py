@@ -41,6 +41,7 @@ from hand_eye_calib.core.base.blocks import (
 from hand_eye_calib.core.base.text import angle, length
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.noise.normal import NormalEquations
+from hand_eye_calib.core.noise.partwise import MAX_POSES
 from hand_eye_calib.core.pairing.motion_pairs import (
     MotionPairs,
     PosePairs,
@@ -65,8 +66,6 @@ _VEHICLE_SIGMA_RATIO = 4.0
 _BLOCK_NS = 1_000_000_000
 # Largest number of motion pairs per block, on average over the recording.
 _MAX_PAIRS_PER_BLOCK = 20
-# Number of motion pairs whose H and S are computed at once. It limits the memory.
-_BATCH = 10_000
 
 # Number of iterations in the estimate of the noise covariance.
 _NOISE_ITERATIONS = 4
@@ -395,8 +394,9 @@ def evidence_by_second(
     lag_s = max(_BLOCK_NS, stats.median(np.diff(stamps_ns))) * 1e-9
     max_pairs = max(duration_ns * _MAX_PAIRS_PER_BLOCK // _BLOCK_NS, 2)
     pairs = pairs_over(pose_pairs, lag_s, max_pairs)
-    starts = range(0, max(len(pairs), 1), _BATCH)
-    batches = [slice(start, start + _BATCH) for start in starts]
+    # Batches limit the memory.
+    starts = range(0, max(len(pairs), 1), MAX_POSES)
+    batches = [slice(start, start + MAX_POSES) for start in starts]
     linearised = [
         residuals_and_jacobians(pairs[batch], T_parent_child)
         for batch in batches

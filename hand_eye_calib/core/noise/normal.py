@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.solvers.all_pairs import RANK_TOLERANCE
 
 # Cyclic reduction ends if at most this number of rows remains; they form one dense matrix. From
 # this number of triangular matrices on, one joint inversion takes a quarter of the time of LAPACK.
@@ -30,10 +31,6 @@ _FEW = 64
 
 # Number of triangular matrices that are inverted together. They fit into the cache.
 _CACHED = 500
-
-# After scaling to ones on the diagonal, a smaller eigenvalue of normal equations is rounding, not
-# information.
-_MIN_INFORMATION = 1e-12
 
 
 def transposed(blocks: FloatArray) -> FloatArray:
@@ -306,9 +303,9 @@ class NormalEquations:
         kept = np.where(both_have, information, 0.0)
         scaled = scale[..., :, None] * kept * scale[..., None, :]
         values, vectors = np.linalg.eigh(scaled)
-        # Replace eigenvalues that are rounding by 1: they add log 1 = 0 to the log determinant, and
-        # the mask excludes them from the root.
-        self._is_observed = values > _MIN_INFORMATION
+        # The diagonal is 1, so a smaller eigenvalue is rounding. Replace such eigenvalues by 1:
+        # they add log 1 = 0 to the log determinant, and the mask excludes them from the root.
+        self._is_observed = values > RANK_TOLERANCE
         values = np.where(self._is_observed, values, 1.0)
         self._axes = scale[..., :, None] * vectors
         inverse_roots = self._is_observed / np.sqrt(values)

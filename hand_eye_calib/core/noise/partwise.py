@@ -23,7 +23,7 @@ from hand_eye_calib.core.noise.state_space import (
     combined,
 )
 
-# Largest number of poses of a recording that is not divided, and of a batch of first residuals.
+# Largest number of poses of a recording that is not divided. Batches of residuals are as large.
 MAX_POSES = 10_000
 # Largest number of poses of a part. The posterior of such a part needs about 45 MB. For a simulated
 # drive of 100,000 poses, parts of 20,000 increase the sigmas by 0.05 %.

@@ -31,8 +31,8 @@ from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.pairing.motion_pairs import MotionPairs
 from hand_eye_calib.core.solvers import quadratic_form
 
-# Singular values below this share of the largest one are rounding: the motion does not excite their
-# directions.
+# Singular values and eigenvalues below this share of the largest one are rounding: the motion does
+# not excite their directions.
 RANK_TOLERANCE = 1e-12
 
 
