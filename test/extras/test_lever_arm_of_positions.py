@@ -330,7 +330,7 @@ class TestLeverArm:
         north_east = Trajectory.from_positions(
             child.stamps_ns, child.poses[:, [1, 0, 2], 3]
         )
-        assert codes(parent, north_east) == ["unrelated", "left_handed"]
+        assert codes(parent, north_east) == ["left_handed", "unrelated"]
         from_pole_to_pole = [0.0, 0.0, 6.4e6] * (-1.0) ** np.arange(320)[
             :, None
         ]
