@@ -24,8 +24,10 @@ import hand_eye_calib as hec
 from hand_eye_calib.core.base.errors import ConfigError, NotEnoughDataError
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
+from hand_eye_calib.core.geometry.span import Span
 from hand_eye_calib.extras.ground import bags
 from hand_eye_calib.formats.bags.points import rows_of_points
+from hand_eye_calib.formats.bags.reader import PoseBag
 from hand_eye_calib.offline.cli.main import main
 
 IMU = "sensor_msgs/msg/Imu"
@@ -432,6 +434,27 @@ def bag_of_lidars(tmp_path_factory):
     path = tmp_path_factory.mktemp("lidars") / "bag"
     write_drive(path)
     return path
+
+
+def test_a_part_of_a_recording_uses_the_clouds_of_this_part(
+    bag_of_lidars, tmp_path, capsys
+):
+    with PoseBag(bag_of_lidars) as bag:
+        stream, _ = bag.trajectory("/a")
+        part = Span(5.0, 15.0).cut([stream], ["/a"])[0]
+        whole_ns = [
+            stamp_ns for stamp_ns, _ in bags._clouds(bag, "/a/points", stream)
+        ]
+        part_ns = [
+            stamp_ns for stamp_ns, _ in bags._clouds(bag, "/a/points", part)
+        ]
+    elapsed_s = (np.array(part_ns) - stream.stamps_ns[0]) * 1e-9
+    assert 0 < len(part_ns) < len(whole_ns)
+    assert elapsed_s.min() >= 4.0
+    assert elapsed_s.max() <= 16.0
+    limits = ("--start", "2", "--end", str(int(stream.duration_s) - 2))
+    calibrated(tmp_path, bag_of_lidars, capsys, *limits)
+    assert (tmp_path / "out" / "report.html").exists()
 
 
 @pytest.mark.filterwarnings("ignore:ground from")

@@ -28,6 +28,10 @@ _IMU = "sensor_msgs/msg/Imu"
 # Largest number of scans that are used, evenly spaced in time.
 _MAX_SCANS = 300
 
+# Longest time (ns) before the first pose and after the last one for which poses are extrapolated:
+# an odometry may begin some scans after the clouds.
+_EXTRAPOLATED_NS = 1_000_000_000
+
 
 # Quantity that the messages of a type measure.
 _QUANTITIES = {POINTS_TYPE: "ground", _IMU: "gravity"}
@@ -134,7 +138,8 @@ def vertical_track(
     sensor measures.
     """
     if bag.topics[topic].type == POINTS_TYPE:
-        return ground_from_clouds(_clouds(bag, topic), stream, other_source)
+        clouds = _clouds(bag, topic, stream)
+        return ground_from_clouds(clouds, stream, other_source)
     stamps_ns = []
     forces = []
     for message in _messages(bag, topic, 0):
@@ -148,15 +153,24 @@ def vertical_track(
     )
 
 
-def _clouds(bag: PoseBag, topic: str) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the stamp (ns) and the finite points (N, 3), m, of at most ``_MAX_SCANS`` scans."""
+def _clouds(
+    bag: PoseBag, topic: str, stream: Trajectory
+) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the stamp (ns) and the finite points (N, 3), m, of at most ``_MAX_SCANS`` scans.
+
+    Scans before and after the poses of the stream are skipped: it may be a part of the recording.
+    """
+    first_ns = stream.stamps_ns[0] - _EXTRAPOLATED_NS
+    last_ns = stream.stamps_ns[-1] + _EXTRAPOLATED_NS
     every_ns = bag.duration_s / _MAX_SCANS * 1e9
     for message in _messages(bag, topic, every_ns):
+        stamp_ns = ns_of(message.header.stamp) or 0
+        if not first_ns <= stamp_ns <= last_ns:
+            continue
         rows = rows_of_points(message)
         columns = [rows[axis] for axis in "xyz"]
         points = np.stack(columns, axis=-1).astype(float)
         is_finite = np.isfinite(points).all(axis=1)
-        stamp_ns = ns_of(message.header.stamp) or 0
         yield stamp_ns, points[is_finite]
 
 
