@@ -75,6 +75,9 @@ def test_the_track_goes_through_the_dots_only_with_the_lever_arm():
         distances = np.linalg.norm(dots[:, None] - dense, axis=2).min(axis=1)
         medians[colour] = np.median(distances)
     assert medians["parent"] < 0.5 * medians["muted"]
+    # Matplotlib's own style has a white background, which is visible on a dark page.
+    white = [name for name, figure in drawn.items() if "#ffffff" in figure.svg]
+    assert not white
 
 
 def test_the_turning_part_of_a_path_is_its_turn():

@@ -215,7 +215,6 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
     )
 
 
-@page_style()
 def _axes_of_motion(positions: FloatArray) -> tuple[int, int, int]:
     """Return both axes of the plane of motion of positions (N, 3), and the axis across this plane.
 
@@ -234,6 +233,7 @@ def _name_plane(plane: Axes, first: int, second: int) -> None:
     plane.set_aspect("equal", adjustable="datalim")
 
 
+@page_style()
 def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     """Draw both paths of a sensor: in the plane of motion, and across this plane over time."""
     rows = _downsample(len(evidence.times_s))
