@@ -178,7 +178,7 @@ class TestRefusals:
             0.0,
             0.0,
             {"reference": "B50"},
-            "reference B50 needs more than 50 common poses; 11 are there",
+            "reference B50 needs more than 50 common poses, found 11",
         ),
         (40, 0.005, 0.0, {"max_gap": 0.01}, "raise max_gap"),
     ],

@@ -172,7 +172,7 @@ def test_a_stream_in_another_convention_is_repaired_and_that_is_said(
     )
     solved = as_options(repairs)
     undo = as_options(defaults)
-    sentence = f"Solved with {solved}: USE; as the streams are: DO NOT USE (undo with {undo})"
+    sentence = f"Solved with {solved}: USE; without the repair: DO NOT USE (undo with {undo})"
     assert sentence in warning
 
 
@@ -187,7 +187,7 @@ def test_inverse_poses_on_a_clock_an_hour_off_and_in_feet(streams, scale):
     assert_allclose(result.T_parent_child, expected, atol=1e-3)
     assert result.verdict is Verdict.USE_WITH_CARE
     assert result.time_offset_s == pytest.approx(-3600.0, abs=1e-3)
-    assert "as the streams are: no result" in "\n".join(result.warnings)
+    assert "without the repair: no result" in "\n".join(result.warnings)
 
 
 def test_what_was_given_is_kept_spoils_the_verdict_and_the_advice_undoes_it(

@@ -433,9 +433,7 @@ class TestCommand:
     def test_good_streams(self, files, capsys):
         assert main(["check", *files(*drive())]) == 0
         out, err = capsys.readouterr()
-        assert out.startswith(
-            "No fault found in these streams; calibrate states"
-        )
+        assert out.startswith("No fault found in these streams; run calibrate")
         assert "500" in out
         assert err == ""
 
@@ -447,7 +445,7 @@ class TestCommand:
         out, err = capsys.readouterr()
         assert "ERROR    time_offset" in out
         assert out.startswith(
-            "DO NOT USE as they are: calibrate with --time-offset estimate.\n"
+            "DO NOT USE these streams unchanged: calibrate with --time-offset estimate.\n"
         )
         assert len(err.splitlines()) == 1
         assert (

@@ -98,6 +98,6 @@ def test_check_reads_both_streams_as_calibrate_does(capsys):
     out = capsys.readouterr().out
     # Before the choice between both readings, the check proposed to invert both streams.
     assert out.startswith(
-        "DO NOT USE as they are: calibrate with --time-offset estimate."
+        "DO NOT USE these streams unchanged: calibrate with --time-offset estimate."
     )
     assert "inverse" not in out

@@ -42,7 +42,7 @@ def drive_over_ramps(n_poses=300, flat_s=12.0):
 def assert_both_advise_a_remedy(statuses):
     endings = {
         "extrinsic": "check value, unit and sign of prior.z, or remove it",
-        "progress": "Correct it (value, unit, sign), or remove it.",
+        "progress": "Correct the value (number, unit, sign), or remove it.",
     }
     for name in endings:
         status = statuses[f"/calibrator: {name}"]

@@ -137,14 +137,10 @@ def correlate_rates(
     """
     if min(len(parent), len(child)) < 4:
         return Correlation()
-    step_s = float(
-        np.clip(
-            max(parent.interval_s, child.interval_s), _MIN_STEP_S, _MAX_STEP_S
-        )
-    )
-    step_s = max(
-        step_s, max(parent.duration_s, child.duration_s) / _MAX_SAMPLES
-    )
+    longer_interval_s = max(parent.interval_s, child.interval_s)
+    step_s = float(np.clip(longer_interval_s, _MIN_STEP_S, _MAX_STEP_S))
+    longer_s = max(parent.duration_s, child.duration_s)
+    step_s = max(step_s, longer_s / _MAX_SAMPLES)
     window_s = max(_WINDOW_STEPS * step_s, _MIN_WINDOW_S)
     parent_rates = angular_rates(parent, window_s, step_s, max_gap_s, of_speed)
     child_rates = angular_rates(child, window_s, step_s, max_gap_s, of_speed)
@@ -314,8 +310,10 @@ def _masked_correlation(
         spectra.append(
             np.fft.rfft([mask.astype(float), filled, filled**2], size)
         )
-    # Sums over the common samples at each lag are inverse transforms of products of spectra.
+    # Sums over the common samples at each lag are inverse transforms of products of spectra. For
+    # the roots of the first rates: spectra of their mask, their values and their squares.
     one_a, a, aa = spectra[0]
+    # The same spectra for the roots of the second rates.
     one_b, b, bb = np.conj(spectra[1])
     count = np.round(np.fft.irfft(one_a * one_b, size))
     divisor = np.maximum(count, 1.0)

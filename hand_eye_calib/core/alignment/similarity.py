@@ -195,14 +195,12 @@ def fit_similarity(
         if fits[-1].unexplained < EXPLAINED:
             break
     fits = fits or [problem.describe(T, scale, 0.0)]
-    # The best fit has the smallest residuals (product of both standard deviations), in the smaller
-    # unit of length.
-    return min(
-        fits,
-        key=lambda fit: (
-            fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1)
-        ),
-    )
+
+    def size_of_residuals(fit: SimilarityFit) -> float:
+        # Lengths are in the smaller unit: otherwise a scale near zero would win.
+        return fit.sigma_translation * fit.sigma_rotation / min(fit.scale, 1)
+
+    return min(fits, key=size_of_residuals)
 
 
 def _starts(pairs: MotionPairs) -> list[tuple[FloatArray, float]]:
@@ -330,7 +328,10 @@ class _Problem:
             self.free.append(_SCALE)
         if twists is not None:
             self.free.append(_OFFSET)
-        twists_i, twists_j = twists or (np.zeros((len(pairs), 6)),) * 2
+        if twists is None:
+            at_rest = np.zeros((len(pairs), 6))
+            twists = (at_rest, at_rest)
+        twists_i, twists_j = twists
         # Derivatives of B with respect to d. If d is added to the child's stamps, its pose at an
         # instant is the pose that it had d seconds earlier.
         rotated_i = np.einsum("kji,kj->ki", rotation_b, twists_i[:, 3:])
@@ -415,7 +416,7 @@ class _Problem:
         """Return X, scale and offset after Gauss-Newton steps with robust weights from a start."""
         offset_s = 0.0
         for _ in range(_MAX_STEPS):
-            moments = np.zeros((_N_UNKNOWNS + 1,) * 2)
+            moments = np.zeros((_N_UNKNOWNS + 1, _N_UNKNOWNS + 1))
             for part in self.rows(T, scale, offset_s)[0]:
                 flat = part.reshape(-1, _N_UNKNOWNS + 1)
                 moments += flat.T @ flat
@@ -458,16 +459,16 @@ class _Problem:
         by_scale = -solve(blocks.total, range(_SCALE), _SCALE)
         by_offset = -solve(blocks.total, range(_SCALE), _OFFSET)
         weights = blocks.sums[:, _OFFSET, _OFFSET]
-        # A step of d for constant robust weights is too short, because the weights of a block
-        # change with d. This is the share to which Geman-McClure weights reduce the curvature of
-        # the cost.
+        # The robust weights of a block change with d, so a step of d for constant weights is too
+        # short. The second derivative of the Geman-McClure cost is smaller than the curvature for
+        # constant weights; the loss is the part that the change of the weights causes.
         pulls = (rows[:, :, _OFFSET] * rows[:, :, -1]).sum(axis=1) ** 2 / root
-        fall = (
+        loss = (
             pulls.sum()
             / (1.5 * _QUARTER_WEIGHT_SIGMAS**2)
             / max(weights.sum(), 1e-300)
         )
-        curvature_share = float(np.clip(1.0 - fall, 0.5, 1.0))
+        curvature_share = float(np.clip(1.0 - loss, 0.5, 1.0))
         offsets = -blocks.sums[:, _OFFSET, -1] / np.where(
             weights > 0.0, weights, 1.0
         )

@@ -49,8 +49,8 @@ _FACTORS = np.geomspace(1 / 16, 16, 9)
 _SENTENCES = {
     "single": "One recording: nothing to compare with",
     "agree": "{all} agree within their standard deviations",
-    "differ": "{both} differ; one more recording shows which is off",
-    "scatter": "{all} scatter {excess} times more than those of one rig do; none stands out",
+    "differ": "{both} differ; record once more to find out which result is wrong",
+    "scatter": "{all} scatter {excess} times as much as recordings of one rig; none stands out",
     "one off": "{first} differs from the others: {moves}",
     "moved": "The mount has moved before {first}: {moves}",
 }
@@ -350,8 +350,8 @@ def _p_values_of_splits(
 ) -> FloatArray:
     """Return the p-values (N + S,) of all splits of N results into two groups.
 
-    A p-value is the larger one of two tests. The chi-square test is of the decrease of chi-square
-    by the split. The F test compares this decrease with the remaining chi-square.
+    A p-value is the larger p-value of two tests. The chi-square test is of the decrease of
+    chi-square by the split. The F test compares this decrease with the remaining chi-square.
 
     Parameters
     ----------

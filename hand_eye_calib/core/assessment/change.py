@@ -81,7 +81,11 @@ class Moved:
 
     @property
     def what(self) -> str:
-        """The axes that have moved. If no single axis has moved, the two that differ most."""
+        """The axes that have moved, and by how much.
+
+        If more than three axes have moved, the total distance and angle. If no single axis has
+        moved, the two axes that differ most.
+        """
         axes = self._axes_that(Change.MOVED)
         if len(axes) > len(TRANSLATIONS):
             return f"{listing(axes)}, by {listing(self._totals())} in all"
@@ -93,7 +97,7 @@ class Moved:
             moves.append(f"{axis} by {difference} +/- {sigma}")
         return (
             listing(moves)
-            or "by what the axes show together, none of them alone"
+            or "on all axes together, although no single axis differs clearly"
         )
 
     def _most_different_axes(self) -> list[str]:

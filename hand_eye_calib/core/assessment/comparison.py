@@ -163,8 +163,8 @@ def _differences(
     """Test each pair of extrinsics for a difference."""
     if not couples:
         raise InputError(
-            "expected two results or more, or one and the installed transform (--with, in Python "
-            "installed)"
+            "expected two results or more; to compare one result with the installed transform, add "
+            "--with (in Python, pass installed=)"
         )
     return tuple(_difference(*couple) for couple in couples)
 
@@ -244,8 +244,8 @@ def _difference(first: _Named, second: tuple[str, Calibration]) -> Difference:
     covariance, scatter, allowance = _covariances(before) + _covariances(after)
     if not (_is_from_motion(before) and _is_from_motion(after)):
         # Constant sensor errors cancel between two estimates from motion, but not here. The
-        # allowance covers them. Where the scatter between recordings is larger than the allowance,
-        # it is used instead.
+        # variance of an axis is the larger value of two: the allowance, which covers these errors,
+        # and the scatter between recordings.
         scatter = allowance + np.diag(
             np.maximum(np.diag(scatter - allowance), 0.0)
         )

@@ -283,8 +283,8 @@ def find_change(
     """Return the most likely shift of the mount within a recording.
 
     The shift is tested at the start of every second, except near both ends. A ratio below
-    :data:`SIGNIFICANT` is no evidence of a shift. The long-run variance keeps noise that drifts
-    from being reported as a shift. Returns None if the recording is too short.
+    :data:`SIGNIFICANT` is no evidence of a shift. H and S are divided by the long-run variance, so
+    that drifting noise is not reported as a shift. Returns None if the recording is too short.
 
     Parameters
     ----------
@@ -302,6 +302,7 @@ def find_change(
         np.arange(1, n_blocks), _PRIOR_SHARE * SHIFT_INFORMATION
     )
     ratios = log_ratio(shifts / long_run)
+    # Near both ends, one side of the shift is too short for its own estimate.
     n_edge = max(int(n_blocks * _MIN_WINDOWS_PER_SIDE / max(_WINDOW_COUNTS)), 1)
     ratios[: n_edge - 1] = -np.inf
     ratios[len(ratios) - n_edge + 1 :] = -np.inf

@@ -3,7 +3,7 @@
 The estimate from motion X0 has the covariance C. The residuals r(X) of the prior are divided by its
 standard deviations. The result X minimises, by Gauss-Newton steps ``X <- X exp(step)``,
 
-    d(X)' C^-1 d(X) + r(X)' r(X),
+    d(X)' C^-1 d(X) + r(X)' r(X).
 
 Here d(X) is the deviation (rho, phi) of X from X0 in the child's frame. A direction that the motion
 does not reveal is determined by the prior only. Without a prior the direction is unknown; the

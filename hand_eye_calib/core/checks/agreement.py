@@ -103,6 +103,8 @@ _ERROR_DELAY_S = 2.0 * _MIN_DELAY_S
 # The standard deviation of a delay is multiplied by this factor if the delay equals the clock
 # offset: such a delay is expected, and needs less evidence.
 _EXPECTED_SIGMA_SHARE = 2.0 / 3.0
+# A delay equals the clock offset if their ratio differs from 1 by less than this.
+_EXPECTED_DEVIATION = 1.0 - _EXPECTED_SIGMA_SHARE
 # A delay is always an error if it exceeds this time (s), this number of standard deviations, and
 # either the error limit of the shift, or the shift (m) and the explained share below. The largest
 # delays in 81 clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
@@ -197,8 +199,9 @@ def slow_suspects(
 ) -> list[Suspect]:
     """Return the fault that explains most of the motions over some seconds.
 
-    A rotation between positions and orientations is the exception: all three such faults are
-    returned, because they explain about the same share, and any of them may be significant.
+    If this fault is a rotation between positions and orientations, all three faults of this kind
+    are returned: of the child, the parent, or both. They explain about the same share, and any of
+    them may be significant.
     """
     change = find_change(pose_pairs, X)
     slow, axes = motion_regression(
@@ -444,8 +447,9 @@ class _Delay:
         shift_m = self.size_s * self.speed_m_s
         size_m = shift_m
         sigma_m = self.sigma_s * self.speed_m_s
+        # Without an offset, the divisor is 1 s, far above any delay.
         ratio = self.size_s / abs(offset_s or 1.0)
-        is_expected = abs(ratio - 1.0) < 1.0 - _EXPECTED_SIGMA_SHARE
+        is_expected = abs(ratio - 1.0) < _EXPECTED_DEVIATION
         if is_expected:
             sigma_m *= _EXPECTED_SIGMA_SHARE
         error_m = LIMITS["late"].error
@@ -542,8 +546,8 @@ def smoothing_suspects(
 ) -> Iterator[Suspect]:
     """Yield suspects for a stream in which either the positions or the orientations are smoothed.
 
-    The displacement of the poses decides whether smoothing is an error. Its time constant times the
-    usual speed decides whether it is a warning.
+    The displacement of the poses decides whether smoothing is an error. The time constant of the
+    smoothing times the usual speed decides whether smoothing is a warning.
 
     Parameters
     ----------

@@ -115,11 +115,12 @@ class CheckResult:
     offset : TimeOffset or None
         Clock offset in addition to the ``time_offset_s`` of the check; None without a fit.
     readings : Readings or None
-        Two readings that fit about equally well, if the reading of the findings may be wrong;
-        otherwise None. The other reading also inverts both streams.
+        Two readings that fit about equally well, if the chosen reading may be wrong; otherwise
+        None. The second reading also inverts both streams.
     open_covariance : (6, 6) array
-        Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad, for faults that
-        the streams neither prove nor exclude. It is part of the allowance of a checked result.
+        Covariance of xi = (rho, phi) in ``T_parent_child @ exp(xi)``, in m and rad. It covers
+        faults that the streams neither prove nor exclude, and is part of the allowance of a checked
+        result.
     """
 
     findings: tuple[Finding, ...]
@@ -252,8 +253,8 @@ def _check_explained(
         corrected, explanation, offset.fit, arguments.scale
     )
     lengths = _lengths_of_explained(streams, corrected, fit, explanation)
-    # If the reading is unclear, add its findings: both streams may contain inverse poses, or
-    # neither.
+    # If the reading is unclear, both streams may contain poses after all. The findings about
+    # inverse poses must then neither end the checks nor judge streams in an unknown unit.
     of_reading = explanation.findings if explanation.may_be_uninverted else ()
     readings = explanation.readings
     if readings and lengths:
@@ -333,7 +334,7 @@ def _preferred_reading(
 
 
 def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
-    """Return the smallest length (m) of a lever arm within its standard deviations.
+    """Return the smallest plausible length (m) of a lever arm: 0 if its sigmas are large.
 
     Parameters
     ----------
@@ -344,9 +345,9 @@ def least_lever_arm(T_parent_child: FloatArray, sigmas: FloatArray) -> float:
     sizes = (
         np.abs(se3.translation_of(T_parent_child)) - _LEVER_ARM_SIGMAS * sigmas
     )
-    return float(
-        np.linalg.norm(np.clip(np.nan_to_num(sizes, neginf=0.0), 0.0, None))
-    )
+    # An axis with an infinite standard deviation contributes no length.
+    finite_sizes = np.nan_to_num(sizes, neginf=0.0)
+    return float(np.linalg.norm(np.clip(finite_sizes, 0.0, None)))
 
 
 def _explain_by_extrinsic(
@@ -471,7 +472,7 @@ def _check_sizes(
     timed: SimilarityFit | None,
     used_scale: float,
 ) -> tuple[list[Finding], SimilarityFit]:
-    """Return the fit, and the findings about scale and unobservable axes, of streams that agree.
+    """Return the findings about scale and unobservable axes of streams that agree, and the fit.
 
     The scale is fitted if the unit of length is unclear. ``timed`` is the fit at the refined time
     offset, if there is one. ``used_scale`` is the factor that the child's lengths already contain.

@@ -39,6 +39,7 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
     if added_s and abs(values["total_s"]) <= max(
         3.0 * offset.sigma_s, _NO_OFFSET_S
     ):
+        # The recorded clocks agree, so the added offset was wrong.
         values["options"] = {"time_offset": 0.0}
         severity = clocks_differ.severity
         return [finding("needless_time_offset", "child", severity, **values)]
@@ -63,6 +64,7 @@ def check_model_scale(scale: float, sigma: float) -> list[Finding]:
     """
     if sigma <= 0.0:
         return []
+    # The factor corrects the child's lengths, so these are 1 / scale times too long.
     excess = 1.0 / scale - 1.0
     sigma_excess = sigma / scale**2
     other_scale = graded(
@@ -107,7 +109,7 @@ def own_unit(
 def in_metres(
     findings: Sequence[Finding], units: Sequence[Finding], scale: float
 ) -> list[Finding]:
-    """Return the findings, with rounded positions graded by the rounding in metres.
+    """Return the findings, with the severity of rounded positions by their rounding in metres.
 
     Parameters
     ----------
@@ -116,21 +118,23 @@ def in_metres(
     units : sequence of Finding
         Findings about the unit of length of a stream. Their options convert its lengths to metres.
     scale : float
+        Factor of the child's lengths in ``findings``.
     """
     options: dict[str, Any] = {}
     for unit in units:
         if unit.code in ("units", "lengths"):
             options.update(unit.options)
+    # Factors from the lengths in ``findings`` to metres.
     factors = {
         "parent": float(options.get("parent_scale", 1.0)),
         "child": float(options.get("scale", scale)) / scale,
     }
-    in_metres: list[Finding] = []
+    graded_findings: list[Finding] = []
     for found in findings:
         if found.code != ROUNDED:
-            in_metres.append(found)
+            graded_findings.append(found)
             continue
         step_m = found.evidence["step_m"] * factors[found.stream]
         if rounded := graded(ROUNDED, found.stream, step_m, step_m=step_m):
-            in_metres.append(rounded)
-    return in_metres
+            graded_findings.append(rounded)
+    return graded_findings

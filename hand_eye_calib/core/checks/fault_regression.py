@@ -34,7 +34,7 @@ from typing import TypeAlias
 import numpy as np
 
 from hand_eye_calib.core.assessment.covariance import BLOCKS
-from hand_eye_calib.core.base.arrays import FloatArray
+from hand_eye_calib.core.base.arrays import BoolArray, FloatArray, IntArray
 from hand_eye_calib.core.base.blocks import Blocks, solve
 from hand_eye_calib.core.base.stats import median, robust_sigma, robust_weights
 from hand_eye_calib.core.geometry import se3
@@ -65,7 +65,7 @@ _MIN_UNIT_RAD = 1e-8
 # Group of the base that is left out if the key is fitted: scales by axis contain the scale.
 _REPLACED = {"axes_child": "scale", "axes_parent": "scale"}
 
-# Regressors (K, 6, m) of K motions, by the name of their group.
+# Regressors (K, 6, n) of K motions, by the name of their group of n regressors.
 _Groups: TypeAlias = Mapping[str, FloatArray]
 
 
@@ -101,22 +101,10 @@ class Regression:
             (rows[:, :3] ** 2).sum(axis=1).mean(axis=0)
         )
         rows = rows / units
-        n_motions, size, n_columns = rows.shape
+        n_motions, _, n_columns = rows.shape
         flat = rows.reshape(-1, n_columns)
         of_base = flat[:, [*self._columns_of(base), n_columns - 1]]
-        weights = np.ones(n_motions)
-        for _ in range(ROUNDS):
-            products = (of_base * np.repeat(weights, size)[:, None]).T @ of_base
-            coefficients = solve(products, range(len(products) - 1))
-            residuals = of_base[:, -1] - of_base[:, :-1] @ coefficients
-            lengths = np.sqrt(
-                (residuals.reshape(n_motions, size) ** 2).sum(axis=1)
-            )
-            self._sigma = max(median(lengths) / np.sqrt(size), 1e-12)
-            squared = (lengths / self._sigma) ** 2 / (
-                size * _QUARTER_WEIGHT_SIGMAS**2
-            )
-            weights = robust_weights("geman_mcclure", squared)
+        self._sigma, weights = _robust_fit(of_base, n_motions)
         self._total_weight = float(weights.sum())
         weighted = rows * weights[:, None, None]
         # Products of all columns, summed with the weights, (p + 1, p + 1).
@@ -135,7 +123,7 @@ class Regression:
         return self._columns_of([*base, *nuisances])
 
     def biases(self, group: str) -> FloatArray:
-        """Return the largest bias (m,) of a group's coefficients by noise of the regressors.
+        """Return the largest bias of a group's n coefficients by noise of the regressors, (n,).
 
         The noise of the regressors is assumed to be as large as the noise of the residuals.
         """
@@ -144,13 +132,13 @@ class Regression:
         return self._sigma**2 * self._total_weight / squares
 
     def displacements_m(self, group: str) -> FloatArray:
-        """Return the root mean square displacement (m,) that each fault causes if its size is 1."""
+        """Return the root mean square displacements (n,) by each fault of a group for size 1."""
         return self._displacements_m[self._columns[group]]
 
     def response(self, group: str) -> FloatArray:
-        """Return the change (6, m) of X that each fault of size 1 causes if the fit omits it.
+        """Return the changes (6, n) of X by n faults of size 1 that the fit omits.
 
-        The change has the lever arm (m) and a rotation vector (rad), in the parent's axes.
+        A change has the lever arm (m) and a rotation vector (rad), in the parent's axes.
         """
         of_extrinsic = self._columns_of(["lever", "rotation"])
         information = self._products[np.ix_(of_extrinsic, of_extrinsic)]
@@ -173,7 +161,7 @@ class Regression:
         return 1.0 - costs[1] / max(costs[0], 1e-300)
 
     def fit(self, group: str, *nuisances: str) -> tuple[FloatArray, FloatArray]:
-        """Return the coefficients (m,) of a group of m regressors, and their sigmas (m,).
+        """Return the coefficients (n,) of a group of n regressors, and their sigmas (n,).
 
         The base and the groups ``nuisances`` are fitted together with the group.
         """
@@ -187,6 +175,29 @@ class Regression:
         )
         coefficients = self._blocks.solve(columns)
         return coefficients[len(beside) :], np.sqrt(variances[len(beside) :])
+
+
+def _robust_fit(
+    of_base: FloatArray, n_motions: int
+) -> tuple[float, FloatArray]:
+    """Fit the base to K motions robustly; return the noise, and the weights (K,) of the motions.
+
+    The rows of ``of_base`` (6 K, b + 1) have the b regressors of the base, then the observed
+    difference, in units of the noise. The returned noise is in the same units.
+    """
+    size = len(of_base) // n_motions
+    sigma = 0.0
+    weights = np.ones(n_motions)
+    for _ in range(ROUNDS):
+        products = (of_base * np.repeat(weights, size)[:, None]).T @ of_base
+        coefficients = solve(products, range(len(products) - 1))
+        residuals = of_base[:, -1] - of_base[:, :-1] @ coefficients
+        squares = residuals.reshape(n_motions, size) ** 2
+        lengths = np.sqrt(squares.sum(axis=1))
+        sigma = max(median(lengths) / np.sqrt(size), 1e-12)
+        squared = (lengths / sigma) ** 2 / (size * _QUARTER_WEIGHT_SIGMAS**2)
+        weights = robust_weights("geman_mcclure", squared)
+    return sigma, weights
 
 
 class _Stream:
@@ -358,13 +369,7 @@ def delay_regression(
     interval_s = median(np.diff(stamps_ns)) * 1e-9
     step = max(round(_MIN_STEP_S / interval_s), 1)
     step_s = step * interval_s
-    is_regular = np.zeros(len(stamps_ns), dtype=bool)
-    inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
-    multiples = np.array([-2, -1, 1, 2])
-    around_ns = stamps_ns[inner[:, None] + step * multiples]
-    elapsed_s = (around_ns - stamps_ns[inner, None]) * 1e-9
-    errors_s = np.abs(elapsed_s - step_s * multiples)
-    is_regular[inner] = (errors_s < _MAX_STAMP_ERROR * step_s).all(axis=1)
+    is_regular = _are_regular(stamps_ns, step, step_s)
     middles = (motions.i + motions.j) // 2
     has_regular_ends = is_regular[motions.i] & is_regular[motions.j]
     motions = motions[has_regular_ends & is_regular[middles]]
@@ -389,6 +394,21 @@ def delay_regression(
         name: from_other[name] for name in ("late_child", "late_parent")
     }
     return _regression(parent, child, X, groups, instruments, "late")
+
+
+def _are_regular(stamps_ns: IntArray, step: int, step_s: float) -> BoolArray:
+    """Return which poses (N,) have the four stamps around them at multiples of a step.
+
+    A step has ``step`` poses and lasts ``step_s`` seconds. Poses at the ends are not regular.
+    """
+    is_regular = np.zeros(len(stamps_ns), dtype=bool)
+    inner = np.arange(2 * step, len(stamps_ns) - 2 * step)
+    multiples = np.array([-2, -1, 1, 2])
+    around_ns = stamps_ns[inner[:, None] + step * multiples]
+    elapsed_s = (around_ns - stamps_ns[inner, None]) * 1e-9
+    errors_s = np.abs(elapsed_s - step_s * multiples)
+    is_regular[inner] = (errors_s < _MAX_STAMP_ERROR * step_s).all(axis=1)
+    return is_regular
 
 
 def _filter_groups(
@@ -422,7 +442,8 @@ def _filter_groups(
                 displaced, stream.start_minus_end(rate)
             )
         else:
-            # It also changes the parent's orientations at both ends, which rotate the lever arm.
+            # Smoothing also changes the parent's orientations at both ends, which rotate the lever
+            # arm.
             at_start = se3.cross(angular_acceleration[start], lever_arm)
             at_end = se3.cross(angular_acceleration[end], lever_arm)
             orientations += se3.times(stream.R_start, at_start) - se3.times(
@@ -459,9 +480,9 @@ def _base_groups(parent: _Stream, child: _Stream) -> dict[str, FloatArray]:
 def _regressors(
     of_displacement: FloatArray, of_rotation: FloatArray | None = None
 ) -> FloatArray:
-    """Join regressors of displacements and of rotations into one array (K, 6, m).
+    """Join regressors of displacements and of rotations into one array (K, 6, n).
 
-    Each argument is (K, 3, m), or (K, 3) for a single regressor. A fault that causes no rotations
+    Each argument is (K, 3, n), or (K, 3) for a single regressor. A fault that causes no rotations
     has displacements only.
     """
     if of_rotation is None:

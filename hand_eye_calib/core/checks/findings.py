@@ -257,8 +257,8 @@ def answered(
     for found in findings:
         options = dict(found.options)
         if found.code in CONVENTIONS:
-            # A corrected stream that needs the same correction again was right before. The finding
-            # then proposes the default values of these options.
+            # If the configuration already corrects a stream, and the check asks for the same
+            # correction, the recorded stream was right. The finding then proposes the defaults.
             repeated = [
                 name
                 for name, value in options.items()

@@ -36,8 +36,8 @@ from hand_eye_calib.core.pairing.motion_pairs import (
     pairs_over,
 )
 
-# Time constants T (s) of the filters that are tried. A filter whose time constant is between two of
-# these values is detected with both.
+# Time constants T (s) that are tried. A filter with a time constant between two of these values is
+# detected with both values.
 _TIME_CONSTANTS_S = (0.1, 0.3, 1.0, 3.0)
 # Largest number of motions whose differences are fitted.
 _MOST_MOTIONS = 3000
@@ -141,8 +141,8 @@ def check_correction(
         "not_independent",
         "both",
         Severity.ERROR if best.is_certain else None,
-        evidence=f"motions faster than {best.time_constant_s:g} s reveal another mount than slow "
-        f"ones, by {length(best.translation_m)} and {angle(best.rotation_rad)}",
+        evidence=f"motions shorter than {best.time_constant_s:g} s fit another mount than longer "
+        f"motions: they differ by {length(best.translation_m)} and {angle(best.rotation_rad)}",
         shift_m=best.translation_m,
         turn_rad=best.rotation_rad,
         sigmas=max(best.translation_sigmas, best.rotation_sigmas),
@@ -220,7 +220,7 @@ class _Regressors:
         self._to_end = self._from_end @ self._adjoints[self._start]
 
     def _between(self, perturbations: FloatArray) -> FloatArray:
-        """Return the change (K, 6, m) of motions by perturbations (N, 6, m) of poses."""
+        """Return the changes (K, 6, n) of motions by n perturbations (N, 6, n) of each pose."""
         at_start = self._to_end @ perturbations[self._start]
         return perturbations[self._end] - at_start
 
@@ -230,33 +230,30 @@ class _Regressors:
         The errors are an error of the extrinsic (6), a clock offset, a scale, a delay of the
         child's positions after its orientations, and the same delay of the parent.
         """
-        mount = np.eye(6) - self._to_end
+        of_mount = np.eye(6) - self._to_end
         steps = se3.log(se3.inverse(self._poses[:-1]) @ self._poses[1:])
         rates = steps / np.diff(self._seconds)[:, None]
         inner = 0.5 * (rates[1:] + rates[:-1])
         of_clock = np.concatenate([rates[:1], inner, rates[-1:]])
         parents = self._poses @ se3.inverse(self._T_parent_child)
-        of_parent = np.gradient(
+        parent_velocities = np.gradient(
             se3.translation_of(parents), self._seconds, axis=0
         )
-        of_child = np.gradient(
-            se3.translation_of(self._poses), self._seconds, axis=0
-        )
+        child_positions = se3.translation_of(self._poses)
+        child_velocities = np.gradient(child_positions, self._seconds, axis=0)
         to_child = np.swapaxes(se3.rotation_of(self._poses), 1, 2)
         errors = [of_clock]
+        # A scale error displaces a pose along its position, a delay along its velocity.
         for displacements in (
-            se3.translation_of(self._poses),
-            of_child,
-            of_parent,
+            child_positions,
+            child_velocities,
+            parent_velocities,
         ):
             translations = se3.times(to_child, displacements)
-            errors.append(
-                np.concatenate(
-                    [translations, np.zeros_like(translations)], axis=1
-                )
-            )
-        of_motions = self._between(np.stack(errors, axis=2))
-        return np.concatenate([mount, of_motions], axis=2)
+            no_rotations = np.zeros_like(translations)
+            errors.append(np.concatenate([translations, no_rotations], axis=1))
+        of_poses = self._between(np.stack(errors, axis=2))
+        return np.concatenate([of_mount, of_poses], axis=2)
 
     def filtered(self, time_constant_s: float) -> FloatArray:
         """Return the regressors (K, 6, 6) of D, the error of the assumed mount, for one filter.
@@ -339,6 +336,7 @@ class _Differences:
         weights = self._robust_weights(rows)
         table = _table(rows, weights)
         weighted = rows * weights[:, None, None]
+        # The columns of the usual errors are first, then the six columns of D.
         cost = _cost(table, range(self._n_usual + 6))
         cost_without_filter = _cost(table, range(self._n_usual))
         share = 1.0 - cost / max(cost_without_filter, 1e-300)

@@ -110,8 +110,8 @@ def explain(
             )
         if chosen.holds:
             return _with_findings(chosen, streams, lag_s)
+        # Continue with shorter motions: jumps affect fewer of them.
         failed.append(chosen)
-        # Jumps affect fewer of the shorter motions.
     if not failed:
         raise too_few
     best = min(failed, key=lambda explanation: explanation.fit.unexplained)
@@ -186,11 +186,15 @@ def _or_rival(
     lag_s: float,
     limit: float,
 ) -> Explanation:
-    """Return the simplest of the best rivals, or ``plain`` unless they are better by _DECISIVE."""
+    """Return the simplest of the best rivals if they are clearly better; otherwise ``plain``.
+
+    The unexplained share of a rival must be below ``limit``, and smaller than that of ``plain`` by
+    the factor _DECISIVE.
+    """
     if plain.fit.unexplained < EXPLAINED:
         return plain
-    most = min(limit, plain.fit.unexplained / _DECISIVE)
-    best = _below(most, rivals, streams, lag_s)
+    max_unexplained = min(limit, plain.fit.unexplained / _DECISIVE)
+    best = _best_rivals(max_unexplained, rivals, streams, lag_s)
     if not best:
         return plain
     return _fitted(_simplest(best).hypothesis, streams, lag_s)
@@ -201,28 +205,37 @@ def _simplest(explanations: Sequence[Explanation]) -> Explanation:
     return min(explanations, key=lambda explanation: explanation.complexity)
 
 
-def _below(
-    most: float, rivals: Iterable[Hypothesis], streams: StreamPair, lag_s: float
+def _best_rivals(
+    max_unexplained: float,
+    rivals: Iterable[Hypothesis],
+    streams: StreamPair,
+    lag_s: float,
 ) -> list[Explanation]:
-    """Return the rivals with about the smallest unexplained share, which is at most ``most``."""
+    """Return the rivals whose unexplained share is about the smallest of all rivals.
+
+    The result is empty if all shares exceed ``max_unexplained``.
+    """
     pairs = streams.pairs(lag_s, _MAX_ROUGH)
-    few = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
-    first = np.arange(len(pairs))
+    # Correct only the poses that the motions use: first all starts, then all ends.
+    used_poses = streams.synchronised[np.concatenate([pairs.i, pairs.j])]
+    starts = np.arange(len(pairs))
     tried: list[Explanation] = []
     for rival in rivals:
-        parent = rival.corrected("parent", few.Ts_pw_p)
-        child = rival.corrected("child", few.Ts_cw_c)
+        parent = rival.corrected("parent", used_poses.Ts_pw_p)
+        child = rival.corrected("child", used_poses.Ts_cw_c)
         motions = motion_pairs.pairs_between(
-            parent, child, first, first + len(pairs)
+            parent, child, starts, starts + len(pairs)
         )
-        # Stop a fit early if its start leaves far more than ``most`` unexplained.
-        fit = fit_similarity(motions, max_unexplained=_DECISIVE * most)
+        # Stop a fit early if its start leaves far more than ``max_unexplained``.
+        fit = fit_similarity(
+            motions, max_unexplained=_DECISIVE * max_unexplained
+        )
         tried.append(Explanation(rival, fit))
-        most = min(most, _ABOUT_EQUAL * fit.unexplained)
+        max_unexplained = min(max_unexplained, _ABOUT_EQUAL * fit.unexplained)
     return [
         explanation
         for explanation in tried
-        if explanation.fit.unexplained <= most
+        if explanation.fit.unexplained <= max_unexplained
     ]
 
 
@@ -248,16 +261,14 @@ def _or_axes(
     explanation gets the finding "ambiguous".
     """
     unexplained = chosen.fit.unexplained
-    rivals = _below(
+    rivals = _best_rivals(
         _ABOUT_EQUAL * unexplained, hypotheses_of_axes(), streams, lag_s
     )
     if not rivals:
         return chosen, []
     simplest = _simplest(rivals).hypothesis
-    if (
-        _ABOUT_EQUAL**0.5 * min(rival.fit.unexplained for rival in rivals)
-        < unexplained
-    ):
+    smallest = min(rival.fit.unexplained for rival in rivals)
+    if _ABOUT_EQUAL**0.5 * smallest < unexplained:
         return _fitted(simplest, streams, lag_s), []
     _, stream = simplest.mistakes[0]
     return chosen, [finding("ambiguous", stream, detail=simplest.detail)]
@@ -355,7 +366,7 @@ def choose_reading(
 
 
 def _has_one_reading(hypothesis: Hypothesis) -> bool:
-    """Return whether there is no need to compare a hypothesis with both streams inverted."""
+    """Return whether a hypothesis is used without a comparison of poses and inverse poses."""
     if hypothesis.axes is not None:
         return True
     return any(code == "inverse_orientation" for code, _ in hypothesis.mistakes)

@@ -48,10 +48,11 @@ _ROUNDING_RAD = 0.01 * np.radians(0.08)
 # The residual must also be below this share of the angle of rotation between the poses.
 _SMALL_SHARE = 0.005
 
-# Interpolation adds errors. Therefore only poses whose stamps are nearest to a stamp of the other
-# stream are compared: a hundredth of all poses, but at least the first number here. The second
-# number limits the poses: if there are more, every k-th pose is used.
-_NEAREST = (40, 300)
+# Interpolation adds errors. Therefore only the poses whose stamps are nearest to a stamp of the
+# other stream are compared: a hundredth of all poses, but at least this number.
+_MIN_NEAREST = 40
+# Largest number of compared poses: if there are more, every k-th pose is used.
+_MAX_NEAREST = 300
 
 # The shared noise of both streams is measured in the upper half of their spectra. The noise counts
 # as white if both quarters of this half differ by less than this factor.
@@ -82,6 +83,7 @@ _LEAST_DRIFT = 2.5e-5
 _DIFFERENCE_SHARE = 0.9
 # Shortest recording (s) whose growth is judged.
 _GROWTH_S = 45.0
+# Fewest poses of such a recording.
 _GROWTH_POSES = 200
 # Times (s) over which the growth is measured, up to a third of the recording.
 _GROWN_S = (3.0, 8.0, 15.0, 30.0, 60.0)
@@ -96,11 +98,13 @@ _STEADY = 1.25
 # Shortest path (m) on which _STEADY is applied. Hand-held sensors in a motion capture room do not
 # drift either; their paths are shorter (100 m).
 _STEADY_PATH_M = 190.0
-# Noise of the difference of both streams, divided by the noise of the noisier stream, if one stream
-# is a copy: smallest and largest value. The noise of a copy contains the noise of its source,
-# whereas the noise of two sensors adds up. Below the smallest value, the noisier stream consists of
-# motion, or the copy has so little noise of its own that _SHARED detects it.
-_NOISE_OF_COPY = (0.33, 1.1)
+# The next two limits are for the noise of the difference of both streams, divided by the noise of
+# the noisier stream. The noise of a copy contains the noise of its source, whereas the noise of two
+# sensors adds up. Largest ratio for a copy.
+_MAX_NOISE_OF_COPY = 1.1
+# Smallest ratio for a copy. Below this limit the noisier stream consists of motion, or the copy has
+# so little noise of its own that _SHARED detects the copy.
+_MIN_NOISE_OF_COPY = 0.33
 # The noise of one stream is regressed on the noise of the other. The factor is about 1 for a copy
 # and its source, and 0 for two sensors. A stream is a copy if the factor exceeds this limit ...
 _CONTAINED = 0.5
@@ -170,16 +174,16 @@ def _within(computed: Trajectory, source: Trajectory) -> IntArray:
 
 
 def _second_half(computed: Trajectory, source: Trajectory) -> Trajectory:
-    """Return the first _NEAREST[1] poses of ``computed`` after the middle of the common time."""
+    """Return the first _MAX_NEAREST poses of ``computed`` after the middle of the common time."""
     rows = _within(computed, source)
-    return computed[rows[len(rows) // 2 :][: _NEAREST[1]]]
+    second_half = rows[len(rows) // 2 :]
+    return computed[second_half[:_MAX_NEAREST]]
 
 
 def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     """Return the residual angle (rad) between the rotations of both streams.
 
-    Only the poses of ``computed`` whose stamps are nearest to a stamp of ``source`` are used
-    (_NEAREST).
+    Only the poses of ``computed`` whose stamps are nearest to a stamp of ``source`` are used.
     """
     rows = _within(computed, source)
     stamps_ns = computed.stamps_ns[rows]
@@ -187,11 +191,11 @@ def _residual_at_nearest(computed: Trajectory, source: Trajectory) -> float:
     after = np.clip(after, 1, len(source) - 1)
     distances_ns = np.abs(source.stamps_ns[[after - 1, after]] - stamps_ns)
     nearest_ns = distances_ns.min(axis=0)
-    n_near = max(_NEAREST[0], len(rows) // 100)
+    n_near = max(_MIN_NEAREST, len(rows) // 100)
     limit_ns = np.sort(nearest_ns)[:n_near].max(initial=0)
     rows = rows[nearest_ns <= limit_ns]
-    # Use every k-th of these poses, so that at most _NEAREST[1] remain.
-    every = max(-(-len(rows) // _NEAREST[1]), 1)
+    # Use every k-th of these poses, so that at most _MAX_NEAREST remain (division rounded up).
+    every = max(-(-len(rows) // _MAX_NEAREST), 1)
     computed = computed[rows[::every]]
     of_source = source.at(computed.stamps_ns, straight=True)
     start = np.arange(len(computed) - 1)
@@ -216,11 +220,8 @@ def _residual(motions: MotionPairs) -> float:
     residual_rad = quantile(
         np.linalg.norm(motions.rotation_residuals(X), axis=1), USUAL
     )
-    return (
-        residual_rad
-        if residual_rad < _SMALL_SHARE * quantile(angles, USUAL)
-        else np.inf
-    )
+    is_small = residual_rad < _SMALL_SHARE * quantile(angles, USUAL)
+    return residual_rad if is_small else np.inf
 
 
 def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
@@ -231,7 +232,7 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     missing.
     """
     intervals_ns = np.diff(computed.stamps_ns)
-    if len(computed) < _NEAREST[0] or intervals_ns.max() > 1.5 * median(
+    if len(computed) < _MIN_NEAREST or intervals_ns.max() > 1.5 * median(
         intervals_ns
     ):
         return 0.0
@@ -242,13 +243,9 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     of_source = of_source @ se3.nearest_rotation(
         of_source[:, 1].T @ of_computed[:, 1]
     )
-    difference = of_source - of_computed
-    arms = se3.skew(of_computed[:, 1])
-    lever_arm, *_ = np.linalg.lstsq(
-        arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
-    )
-    difference[:, 0] -= arms @ lever_arm
+    difference = _without_lever_arm(of_source - of_computed, of_computed[:, 1])
     is_calm = _is_calm(of_computed, of_source)
+    # Axes of the spectra: quarter, stream, quantity (0 positions, 1 orientations).
     quarters = _upper_quarters(
         np.stack([of_computed, of_source, difference]) * is_calm[:, None, None]
     )
@@ -266,6 +263,21 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     # The difference falls as steeply as motion does, and more steeply than errors that add up.
     is_steep = noise_of_difference[0, 1] > _FLAT**2 * noise_of_difference[1, 1]
     return max(of_orientations, 0.0) if is_steep else 0.0
+
+
+def _without_lever_arm(
+    difference: FloatArray, rotations: FloatArray
+) -> FloatArray:
+    """Subtract the best lever arm from the translations of a difference (N, 2, 3).
+
+    ``rotations`` (N, 3) are the second differences of the rotations of one stream.
+    """
+    arms = se3.skew(rotations)
+    lever_arm, *_ = np.linalg.lstsq(
+        arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
+    )
+    difference[:, 0] -= arms @ lever_arm
+    return difference
 
 
 def _second_differences(Ts: FloatArray) -> FloatArray:
@@ -288,9 +300,10 @@ def _is_calm(of_computed: FloatArray, of_source: FloatArray) -> BoolArray:
 
 
 def _upper_quarters(second_differences: FloatArray) -> FloatArray:
-    """Return the mean spectra (2, S, 2) of the third and the fourth quarter of frequencies.
+    """Return the mean power (2, S, 2) of S streams in the third and fourth quarter of frequencies.
 
-    ``second_differences`` is (S, N, 2, 3). The spectra are of poses: the gain of the differences is
+    ``second_differences`` is (S, N, 2, 3). The axes of the result are quarter, stream and quantity
+    (positions, orientations). The power is that of the poses: the gain of the differences is
     divided out, see :func:`_upper_spectra`.
     """
     amplitudes = np.abs(np.fft.rfft(second_differences, axis=1))
@@ -464,18 +477,17 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
         ]
     )
     streams = streams * _is_calm(*streams)[:, None, None]
-    quarters = _upper_quarters(
-        np.concatenate([streams, [streams[1] - streams[0]]])
-    )
-    # Positions and orientations of two quarters, (2, 2).
+    difference = streams[1] - streams[0]
+    # Axes of the spectra: quarter, stream, quantity (0 positions, 1 orientations).
+    quarters = _upper_quarters(np.concatenate([streams, [difference]]))
     of_noisier = quarters[:, :2].max(axis=1)
     shares = (quarters[:, 2].sum(axis=0) / of_noisier.sum(axis=0)) ** 0.5
-    lowest, highest = _NOISE_OF_COPY
     is_white = of_noisier.max(axis=0) < _FLAT * of_noisier.min(axis=0)
-    is_noise = is_white & (shares > lowest)
-    if not is_noise.any() or (shares[is_noise] > highest).any():
+    is_noise = is_white & (shares > _MIN_NOISE_OF_COPY)
+    if not is_noise.any() or (shares[is_noise] > _MAX_NOISE_OF_COPY).any():
         return False
     of_parent, of_child = quarters[:, :2].sum(axis=0)
+    # The quieter stream is first: it may be the source of the noisier one.
     is_parent_noisier = (of_parent > of_child)[:, None]
     streams = np.where(is_parent_noisier, streams[::-1], streams)
     factors, sigmas = _factors_of_noise(streams)
@@ -527,7 +539,7 @@ def _upper_spectra(second_differences: FloatArray) -> NDArray[np.complex128]:
 
 
 def _size_of_changes(values: FloatArray, n_poses: int) -> FloatArray:
-    """Return the _DIFFERENCE_SHARE quantile (d,) of the changes of values (N, d) over poses."""
+    """Return the _DIFFERENCE_SHARE quantiles (d,) of the changes of values (N, d) over n poses."""
     n_poses = max(n_poses, 1)
     changes = np.abs(values[n_poses:] - values[:-n_poses])
     row = int(_DIFFERENCE_SHARE * len(changes))

@@ -4,10 +4,11 @@ The positions of a stream may be later than its orientations. At constant speed 
 a lever arm, so even a long recording determines the delay only to some milliseconds. A delay below
 the limit of a finding still shifts the extrinsic.
 
-Model: in most streams the standard deviation of the delay is that of the allowance; in a few faulty
-streams it is larger. The regression estimates the delay with a normal error. Bayes' rule returns
-the probability of a fault and the mean square of its delay. The covariance is their product, times
-the squared change of the extrinsic for a delay of 1 s.
+Model: the delay of a stream is normal with mean zero. In most streams its standard deviation is
+FLOOR_TRAVEL_S, which the allowance covers; in a few faulty streams it is _FAULTY_S. The estimate of
+the regression has a normal error. Bayes' rule returns the probability of a fault and the mean
+square of the delay by this fault. The covariance is the product of both, times the squared change
+of the extrinsic for a delay of 1 s.
 """
 
 from typing import NamedTuple
@@ -27,8 +28,9 @@ from hand_eye_calib.core.geometry import se3
 
 _STREAMS = ("child", "parent")
 
-# Share of the streams whose positions are late by a fault.
+# Share of the streams whose positions are late by a fault: an assumption.
 _FAULTY_SHARE = 0.1
+# Standard deviation (s) of the delays of such streams.
 _FAULTY_S = 0.03
 # An estimated delay with a larger standard deviation (s) than this is ignored: the allowance was
 # measured on such recordings, so it covers such delays.
@@ -107,17 +109,20 @@ def _of_stream(fast: Regression, stream: str, X: FloatArray) -> OpenDelay:
 def faulty_variance(delay_s: float, sigma_s: float) -> float:
     """Return the mean square (s^2) of a delay by a fault, times the probability of the fault.
 
-
     Parameters
     ----------
     delay_s, sigma_s : float
         Estimate of the delay and its standard deviation.
     """
+    # Index 0: streams without a fault. Index 1: faulty streams.
     prior_variances = np.array([FLOOR_TRAVEL_S**2, _FAULTY_S**2])
     variances = prior_variances + sigma_s**2
-    logs = np.log([1.0 - _FAULTY_SHARE, _FAULTY_SHARE])
-    logs -= 0.5 * (np.log(variances) + delay_s**2 / variances)
-    faulty_share = 1.0 / (1.0 + np.exp(logs[0] - logs[1]))
+    log_posterior = np.log([1.0 - _FAULTY_SHARE, _FAULTY_SHARE])
+    log_posterior -= 0.5 * (np.log(variances) + delay_s**2 / variances)
+    fault_probability = 1.0 / (
+        1.0 + np.exp(log_posterior[0] - log_posterior[1])
+    )
+    # Posterior of the delay of a faulty stream: mean, and variance ``shrinkage * sigma_s**2``.
     shrinkage = prior_variances[1] / variances[1]
     mean_s = shrinkage * delay_s
-    return float(faulty_share * (mean_s**2 + shrinkage * sigma_s**2))
+    return float(fault_probability * (mean_s**2 + shrinkage * sigma_s**2))

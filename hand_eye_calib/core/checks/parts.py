@@ -47,8 +47,10 @@ _MAX_MOTIONS_OF_END = 300
 # Motions shorter than this share of the median displacement are skipped: at rest, every extrinsic
 # fits.
 _MOVING_SHARE = 0.3
-# Smallest share of its displacements that another part must leave unexplained.
+# A part has another extrinsic if the extrinsic of the rest leaves more than this share of the
+# displacements of the part unexplained ...
 _OTHER_SHARE = 0.25
+# ... and if this share exceeds the unexplained share of the rest by at least this factor.
 _OTHER_FACTOR = 3.0
 # An extrinsic explains a part if it leaves at most this share of its displacements unexplained.
 _EXPLAINED_SHARE = _OTHER_SHARE / _OTHER_FACTOR
@@ -75,15 +77,12 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
         parts = (motions[motions.j < split], motions[motions.i >= split])
         if min(map(len, parts)) < MIN_PAIRS:
             continue
-        first, second = (
-            se3.from_rotation_translation(
-                align_rotation_vectors(part), np.zeros(3)
-            )
-            for part in parts
-        )
+        # Shares that the rotation of the same part, or of the other part, leaves unexplained.
+        second = _rotation_of_part(parts[1])
         if _unexplained(parts[0], second) <= _OTHER_PART:
             # One extrinsic explains both parts, as in most recordings.
             continue
+        first = _rotation_of_part(parts[0])
         by_own = max(
             _unexplained(parts[0], first), _unexplained(parts[1], second)
         )
@@ -97,6 +96,12 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
             return [finding("exchanged", at_s=at_s)]
         return [_parts_turned(first, second, at_s)]
     return []
+
+
+def _rotation_of_part(motions: MotionPairs) -> FloatArray:
+    """Return an extrinsic (4, 4) with the rotation of a part, and translation zero."""
+    rotation = align_rotation_vectors(motions)
+    return se3.from_rotation_translation(rotation, np.zeros(3))
 
 
 def check_other_extrinsic(
@@ -123,7 +128,7 @@ def check_other_extrinsic(
         return []
     shares = _unexplained_path(motions, X)
     block_of = motions.i * _EXCHANGE_BLOCKS // len(pose_pairs)
-    # If X explains all blocks, another extrinsic that explains the ends explains them, too.
+    # If X explains all blocks, there is no part with another extrinsic.
     is_one_part = max(_usual_shares(shares, block_of)) < _EXPLAINED_SHARE
     if is_one_part or (shares < _OTHER_SHARE).all():
         return []
@@ -183,6 +188,7 @@ def _unexplained_path(motions: MotionPairs, X: FloatArray) -> FloatArray:
 
 def _own_fit(motions: MotionPairs) -> SimilarityFit | None:
     """Return the fit to the motions of a part, or None if no extrinsic fits."""
+    # Division rounded up.
     stride = -(-len(motions) // _MAX_MOTIONS_OF_END) or 1
     try:
         fit = fit_similarity(motions[::stride], same_unit=True)
@@ -246,10 +252,13 @@ def _check_exchanged(
     products = of_parent[:, :, None] * of_child[:, None, :]
     blocks = Blocks.gathered(products, block_of, _EXCHANGE_BLOCKS)
     cuts = np.arange(1, _EXCHANGE_BLOCKS)
+    # An exchange after a cut transposes the products of the later blocks.
     exchanged = blocks.before(cuts) + np.swapaxes(blocks.since(cuts), 1, 2)
     rotations = se3.nearest_rotation(exchanged)
+    # The cut whose rotation aligns the vectors best.
     best = int(np.argmax((rotations * exchanged).sum(axis=(1, 2))))
     is_after = (block_of >= cuts[best])[:, None]
+    # Vectors of both sensors, with the exchange undone.
     first = np.where(is_after, of_child, of_parent)
     second = np.where(is_after, of_parent, of_child)
     R = se3.nearest_rotation(blocks.total)
@@ -269,8 +278,8 @@ def _check_exchanged(
 def _unexplained(motions: MotionPairs, X: FloatArray) -> float:
     """Return the share of the rotations that an extrinsic X (4, 4) leaves unexplained.
 
-    The share is the median residual divided by the median angle, of the quarter with the largest
-    angles.
+    The share is the median residual divided by the median angle. Only the quarter of the motions
+    with the largest angles is used.
     """
     angles = se3.rotation_angle(se3.rotation_of(motions.Ts_parenti_parentj))
     are_large = angles >= quantile(angles, 0.75)

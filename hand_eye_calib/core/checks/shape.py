@@ -1,8 +1,9 @@
 """Shape of the motion: evidence for poses or for inverse poses in both streams.
 
 A rigid mount fits poses and inverse poses equally well. But some point of a moving body, such as a
-point of the axle, has a short path. For inverse poses, the point with a short path belongs to the
-world instead of the body. The log ratio of the shortest paths in both readings is the evidence.
+point of the axle, has a short path in the world. If the recorded poses are inverse, they describe
+the motion of the world in the sensor's frame, where each point of the world has a long path. The
+evidence is the log ratio of two shortest paths: for the recorded poses, and for their inverses.
 """
 
 import numpy as np
@@ -14,8 +15,8 @@ from hand_eye_calib.core.checks.stream_pair import LAGS_S, StreamPair
 from hand_eye_calib.core.checks.streams import coarse
 from hand_eye_calib.core.geometry import se3
 
-# Log ratio of the paths for sensors that move around a target, although their poses are not
-# inverse. Measured: 0.4 for a camera.
+# Log ratio of the paths that correct poses may have if the sensors move around a target. Measured:
+# 0.4 for a camera.
 _TARGET_LOG_RATIO = 0.5
 
 # Reweighted rounds of the search for the point with the shortest path.
@@ -47,10 +48,9 @@ def may_be_an_arm(streams: StreamPair) -> bool:
     for poses in (streams.parent.poses, streams.child.poses):
         for candidates in (poses, se3.inverse(poses)):
             positions = se3.translation_of(candidates)
-            if (
-                np.linalg.norm(positions - medians(positions.T), axis=1).max()
-                >= _REACH_M
-            ):
+            from_middle = positions - medians(positions.T)
+            distances_m = np.linalg.norm(from_middle, axis=1)
+            if distances_m.max() >= _REACH_M:
                 return False
     return True
 
@@ -74,21 +74,22 @@ def evidence_for_inverse(
     Returns
     -------
     float, float
-        Log ratio of the paths, and half the log ratio of the lever arms (limited). Both ratios are:
-        the recorded streams over the inverse streams. Positive values are evidence for inverse
-        poses.
+        Log ratio of the paths, and half the log ratio of the lever arms (limited). A ratio is the
+        value of the recorded streams divided by the value of the inverse streams. Positive logs
+        are evidence for inverse poses.
     """
-    logs = []
+    log_ratios = []
     for stream in (corrected.parent, corrected.child):
         poses = coarse(stream, LAGS_S[-1]).poses
         # The motion between stops is not recorded, so the changes of velocity are unknown.
         order = 2 if stream.interval_s < LAGS_S[-1] else 1
         shortest, path_of_origin = _shortest_path(poses, order)
         shortest_of_inverse, _ = _shortest_path(se3.inverse(poses), order)
-        logs.append(
+        log_ratios.append(
             np.log([shortest / shortest_of_inverse, shortest / path_of_origin])
         )
-    paths, relative_to_origin = np.mean(logs, axis=0)
+    # Mean of both streams.
+    paths, relative_to_origin = np.mean(log_ratios, axis=0)
     looks_at_a_point = relative_to_origin < np.log(0.5)
     if looks_at_a_point and paths > 0.0:
         paths = max(paths - _TARGET_LOG_RATIO, 0.0)
@@ -117,12 +118,14 @@ def _evidence_of_lever_arms(corrected: StreamPair, fit: SimilarityFit) -> float:
 def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:
     """Return the path lengths (m) of the body's point with the shortest path, and of its origin.
 
-    A point p of the body is at R p + t. Its path is the sum of the sizes of the changes of R p + t:
-    the first differences for ``order`` 1, the second differences for ``order`` 2.
+    A point p of the body is at R p + t. Its path is the sum of the lengths of the differences of
+    R p + t: first differences for ``order`` 1, second differences for ``order`` 2. Iteratively
+    reweighted least squares minimises this sum.
     """
     changes = np.diff(poses[:, :3], order, axis=0)
     steps = changes[:, :, 3]
     chords = changes[:, :, :3]
+    # Lengths of the differences in each round. Round 0 has the origin, p = 0.
     lengths = [np.linalg.norm(steps, axis=1) + 1e-9]
     for _ in range(_ROUNDS):
         smallest = 0.01 * median(lengths[-1])
@@ -130,8 +133,8 @@ def _shortest_path(poses: FloatArray, order: int) -> tuple[float, float]:
         roots = np.sqrt(weights)
         rows = (roots[:, None, None] * chords).reshape(-1, 3)
         targets = (roots[:, None] * steps).ravel()
-        point = np.linalg.lstsq(rows, targets, rcond=1e-6)[0]
-        remaining = steps - chords @ point
+        minus_p = np.linalg.lstsq(rows, targets, rcond=1e-6)[0]
+        remaining = steps - chords @ minus_p
         lengths.append(np.linalg.norm(remaining, axis=1) + 1e-9)
     paths_m = [float(lengths_m.sum()) for lengths_m in lengths]
     return min(paths_m), paths_m[0]

@@ -61,7 +61,7 @@ _MIN_ROUGHNESS_M = 0.01
 # Largest share of repeated positions. Streams that repeat poses are rough for this other reason.
 _MAX_REPEATS = 0.1
 # The level of a sensor is the mean deviation of its positions from the line between the
-# neighbouring positions. This is the number of periods in the mean.
+# neighbouring positions. Number of periods in this mean.
 _PERIODS_OF_LEVEL = 40
 # Smallest share of the mean squared deviation that the levels must explain. The motion of a body
 # that shakes or walks may have nearly the same period, but its levels vary and explain less.
@@ -184,21 +184,23 @@ def check_positions(
     step_m = max(
         _grid_step(column) for column in se3.translation_of(trajectory.poses).T
     )
-    # A stream without orientations is at most warned of: its rounding acts like other noise.
-    most = (
+    # For a stream without orientations the finding is at most a warning: its rounding acts like
+    # other noise.
+    largest_m = (
         np.inf if trajectory.has_rotations else LIMITS["coarse_positions"].error
     )
-    coarse = graded(
-        "coarse_positions", stream, min(step_m, most), step_m=step_m
+    rounded = graded(
+        "coarse_positions", stream, min(step_m, largest_m), step_m=step_m
     )
-    return [*findings, coarse] if coarse else findings
+    return [*findings, rounded] if rounded else findings
 
 
 def _interleaved(trajectory: Trajectory) -> float:
     """Return the roughness (m) of positions from several sensors in turn, or 0 for one sensor.
 
     Several sensors on one topic publish in turn, with a period in poses. Neighbouring poses then
-    differ more than poses one period apart.
+    differ more than poses one period apart. The levels of the sensors are constant either in the
+    axes of the world or in those of the sensor.
     """
     positions = se3.translation_of(trajectory.poses)
     stamps_ns = trajectory.stamps_ns
@@ -229,22 +231,27 @@ def _interleaved(trajectory: Trajectory) -> float:
     in_sensor = np.einsum(
         "kji,kj->ki", trajectory.poses[1:-1, :3, :3], in_world
     )
-    # The levels of the sensors are constant either in the axes of the world or in those of the
-    # sensor.
     for vectors in (in_world, in_sensor):
-        n_windows = len(vectors) // (_PERIODS_OF_LEVEL * period)
-        n_used = n_windows * _PERIODS_OF_LEVEL * period
-        windows = vectors[:n_used].reshape(
-            n_windows, _PERIODS_OF_LEVEL, period, 3
-        )
-        levels = (windows.mean(axis=1) ** 2).sum(axis=-1).mean(axis=-1)
-        total = (windows**2).sum(axis=-1).mean(axis=(1, 2))
-        if (
-            median(levels / np.maximum(total, 1e-300))
-            >= _MIN_EXPLAINED_BY_LEVELS
-        ):
+        if _explained_by_levels(vectors, period) >= _MIN_EXPLAINED_BY_LEVELS:
             return roughness_m[0]
     return 0.0
+
+
+def _explained_by_levels(deviations: FloatArray, period: int) -> float:
+    """Return the share of the squared deviations (N, 3) that constant levels explain.
+
+    Pose k belongs to the sensor k modulo ``period``. The level of a sensor is the mean of its
+    deviations in a window of time; the result is the median over the windows.
+    """
+    n_windows = len(deviations) // (_PERIODS_OF_LEVEL * period)
+    n_used = n_windows * _PERIODS_OF_LEVEL * period
+    windows = deviations[:n_used].reshape(
+        n_windows, _PERIODS_OF_LEVEL, period, 3
+    )
+    levels = windows.mean(axis=1)
+    level_squares = (levels**2).sum(axis=-1).mean(axis=-1)
+    total_squares = (windows**2).sum(axis=-1).mean(axis=(1, 2))
+    return median(level_squares / np.maximum(total_squares, 1e-300))
 
 
 def _grid_step(values: FloatArray) -> float:
@@ -284,9 +291,8 @@ def check_flat(parent: Trajectory, child: Trajectory) -> list[Finding]:
         # Find the direction in the other sensor whose image in the world scatters least. Its
         # scatter measures the tilt.
         mean = whole.poses[::10, :3, :3].mean(axis=0)
-        tilt_rad = float(
-            np.sqrt(max(np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)[0], 0.0))
-        )
+        variances = np.linalg.eigvalsh(np.eye(3) - mean.T @ mean)
+        tilt_rad = float(np.sqrt(max(variances[0], 0.0)))
         if tilt_rad > _MIN_TILT_RAD:
             return [
                 finding(
@@ -424,8 +430,14 @@ def check_lengths(
     options: dict[str, float | str] = {"parent_scale": factor}
     if are_both:
         options["scale"] = factor
-    is_clear = " or " not in unit
+    # The lower limit for large machines is exceeded, and needs the lever arm as a reason.
     is_by_lever_arm = not is_too_fast(parent)
+    beside = ""
+    if is_by_lever_arm:
+        beside = f", {lever_arm_m:.0f} m away from the child"
+    condition = ""
+    if " or " in unit:
+        condition = "give the factor 0.01 for centimetres; for millimetres, "
     return [
         finding(
             "lengths",
@@ -435,12 +447,8 @@ def check_lengths(
             unit=unit,
             speed_m_s=speed,
             acceleration_m_s2=change,
-            beside=f", {lever_arm_m:.0f} m away from the child"
-            if is_by_lever_arm
-            else "",
-            condition=""
-            if is_clear
-            else "0.01 is for centimetres; if they are millimetres, ",
+            beside=beside,
+            condition=condition,
         )
     ]
 

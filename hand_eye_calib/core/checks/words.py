@@ -52,7 +52,7 @@ WORDS = {
     "gaps": FindingWords(
         "the {stream} stream has gaps: {gaps}, of up to {longest_s:.2f} s ({share:.0%} of the "
         "time)",
-        "nothing is paired across a gap; raise max_gap if the motion there is smooth",
+        "no poses are paired across a gap; raise max_gap if gaps have smooth motion",
         severity=Severity.NOTE,
     ),
     "jumps": FindingWords(
@@ -64,29 +64,29 @@ WORDS = {
     "frozen": FindingWords(
         "the {stream} stream repeats the same pose for {frozen_s:.1f} s ({share:.1%} of the time) "
         "while the other sensor moves",
-        "find out why its source stopped; {longest} without this fault",
+        "find out why the source stopped; {longest} without this fault",
     ),
     "interleaved": FindingWords(
-        "{whose} poses alternate between two levels {distance_m:.2g} m apart",
-        "give each its own topic, and calibrate one",
+        "{whose} poses alternate between two paths {distance_m:.2g} m apart",
+        "give each publisher its own topic, and calibrate with one of these topics",
         "two sensors, or two programs, publish on one topic",
     ),
     "interpolated": FindingWords(
         "{share:.0%} of {whose} positions lie on straight lines between their neighbours: they are "
-        "interpolated between few measured ones",
-        "give the positions as they were measured",
+        "interpolated between few measured positions",
+        "use the measured positions, without interpolation",
     ),
     "propagated": FindingWords(
-        "{whose} poses are corrected every {interval_s:.2g} s, by {size_m:.2g} m or rad: between "
-        "the corrections they are predicted",
-        "give the poses at the corrections alone, or those of a smoother",
+        "{whose} poses jump every {interval_s:.2g} s by {size_m:.2g} m or rad: they are predicted, "
+        "and each jump is a correction by a measurement",
+        "use only the poses at the corrections, or the poses of a smoother",
         "propagation by an IMU or at constant velocity between fixes",
         severity=Severity.WARNING,
     ),
     "arrival": FindingWords(
-        "{whose} stamps scatter by {scatter_ms:.0f} ms, and {share:.0%} follow the stamp before at "
-        "once: at this speed poses are off by {shift_m:.2g} m",
-        "give the stamps of the measurements (header stamps), or a local line through the stamps",
+        "{whose} stamps scatter by {scatter_ms:.0f} ms, and {share:.0%} of them come right after "
+        "the previous stamp: at this speed poses are off by {shift_m:.2g} m",
+        "use the stamps of the measurements (header stamps), or smooth the stamps",
         "stamps of the arrival of messages that waited in a queue",
         severity=Severity.WARNING,
     ),
@@ -107,8 +107,8 @@ WORDS = {
         "{whose} lengths seem to be in {unit}: in metres the parent would move at "
         "{speed_m_s:.0f} m/s and change its velocity by {acceleration_m_s2:.0f} m/s within a "
         "second{beside}, which no vehicle does",
-        "give all lengths in metres, those of a file also by the unit in its header, such as "
-        "x_mm; {condition}solve with",
+        "convert all lengths to metres, or name the unit in the header of the file, such as x_mm; "
+        "{condition}solve with",
     ),
     # Findings about both streams.
     "unrelated": FindingWords(
@@ -153,7 +153,7 @@ WORDS = {
     ),
     "quaternion_order": FindingWords(
         "{whose} quaternions seem to be written w x y z and read as x y z w",
-        "write them as x y z w",
+        "write the quaternions as x y z w",
     ),
     "quaternion_names": FindingWords(
         "{whose} quaternions seem to be written x y z w, under names that say w x y z",
@@ -171,8 +171,8 @@ WORDS = {
     ),
     "axes": FindingWords(
         "{whose} positions are in other axes than its orientations: (x, y, z) should be ({detail})",
-        "write positions and orientations in the same right-handed axes; in a file, call angles "
-        "that are clockwise from north heading, all others yaw",
+        "write positions and orientations in the same right-handed axes; in a file, name an angle "
+        "clockwise from north 'heading', and any other angle about z 'yaw'",
     ),
     "euler_order": FindingWords(
         "{whose} orientations seem to be intrinsic angles (about the turned axes, roll first) that "
@@ -196,9 +196,10 @@ WORDS = {
         "latitude, longitude and height in place of the positions",
     ),
     "ambiguous": FindingWords(
-        "this motion fits another explanation as well: {whose} positions are in other axes, "
-        "(x, y, z) for ({detail}). That gives another rotation",
-        "look at the result, or rotate about other axes, too (a vehicle: over slopes or kerbs)",
+        "a second explanation fits this motion, and has another rotation: {whose} positions are in "
+        "other axes, and (x, y, z) should be ({detail})",
+        "compare the rotation of the result with the mount, or rotate about other axes, too (a "
+        "vehicle: over slopes or kerbs)",
         severity=Severity.WARNING,
     ),
     "inverse": FindingWords(
@@ -213,16 +214,16 @@ WORDS = {
         "(which is what a fixed camera beside an arm needs)",
     ),
     "inverse_unclear": FindingWords(
-        "two readings fit alike: {first}, or {second}. Neither noise nor shape of the motion "
+        "two explanations fit alike: {first}, or {second}. Neither noise nor shape of the motion "
         "decides between them",
-        "give parent_invert and child_invert: none for poses of the sensor in its world, poses for "
-        "poses of the world in the sensor",
+        "give parent_invert and child_invert: the value 'none' if the poses are of the sensor in "
+        "its world, the value 'poses' if they are of the world in the sensor",
         "small or short motion, or a fixed camera beside an arm",
         code="{code}",
     ),
     "inverse_small": FindingWords(
-        "both streams were inverted, as their noise and shape ask for; poses of a fixed camera "
-        "beside an arm look like that, too",
+        "both streams were inverted, because noise and shape of the motion are those of inverse "
+        "poses; correct poses of a fixed camera beside an arm look the same",
         "give parent_invert none and child_invert none for a fixed camera beside an arm",
         severity=Severity.WARNING,
         code="inverse_both",
@@ -248,18 +249,18 @@ WORDS = {
     "units": FindingWords(
         "{whose} lengths are {unit} while the {other}'s are metres (factor {scale:.5g} +/- "
         "{sigma:.2g})",
-        "convert them to metres; if the child has no unit, such as a single camera, have the scale "
-        "estimated",
+        "convert these lengths to metres; if the child has no unit, like a single camera, have the "
+        "scale estimated (scale estimate)",
     ),
     "unit_or_scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g}: the child "
-        "has a scale of its own, as a single camera, or the parent's lengths are {unit}",
+        "has a scale of its own, like a single camera, or the parent's lengths are {unit}",
         "give scale estimate, or parent_scale {factor:g} if the parent's lengths are {unit}",
     ),
     "scale": FindingWords(
         "the child's lengths must be multiplied by {scale:.5g} +/- {sigma:.2g} to agree with the "
         "parent's",
-        "find out which of the two measures wrongly; have the scale estimated (scale estimate), or "
+        "find out which sensor has wrong lengths; have the scale estimated (scale estimate), or "
         "set it",
     ),
     "one_axis": FindingWords(
@@ -277,15 +278,15 @@ WORDS = {
     "same_frame": FindingWords(
         "both streams are of the same frame: the extrinsic is the identity within {size}",
         "give the stream of the child sensor itself",
-        "such as two topics of one odometry, or odometry of the robot's base that was derived from "
+        "for example two topics of one odometry, or odometry of the robot's base derived from "
         "the other sensor",
     ),
     "same_position": FindingWords(
         "both streams have the same positions and other orientations: the translation between the "
         "sensors is zero ({size})",
         "give positions of the child sensor itself",
-        "such as positions that were fused from the other sensor, or computed for another point of "
-        "the robot than the sensor",
+        "for example positions from the other sensor, or positions of another point of the robot "
+        "than the sensor",
     ),
     "rotation_gain": FindingWords(
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
@@ -295,8 +296,8 @@ WORDS = {
     ),
     "turns": FindingWords(
         "every rotation of the child is {times:.2g} times that of the parent",
-        "correct its orientations: x, y, z of a quaternion are for half the angle; angles in a "
-        "file need their unit in the header, such as yaw_deg",
+        "correct the child's orientations: a quaternion contains half the angle; angles in a file "
+        "need their unit in the header, such as yaw_deg",
         "radians read as degrees, or half or twice the angles",
         code="rotation_gain",
     ),
@@ -324,12 +325,13 @@ WORDS = {
     ),
     "model_scale": FindingWords(
         "the child's lengths are {size} % {than} than the parent's; this result corrects them",
-        "find out which of the two measures wrongly; if you do not trust either, have the scale "
-        "estimated (scale estimate)",
+        "find out which sensor has wrong lengths; if you trust neither, have the scale estimated "
+        "(scale estimate)",
         "a wheel radius, a camera's baseline or a map that is stretched",
     ),
     "axis_scale": FindingWords(
-        "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its others",
+        "{whose} {axis} coordinates are {factor:.4f} +/- {sigma:.4f} times as long as its other "
+        "coordinates",
         "write all coordinates in metres, from one source; check that latitude and longitude are "
         "not exchanged",
         "heights in feet, of a barometer or constant (2D), or map coordinates whose scale depends "
@@ -344,8 +346,8 @@ WORDS = {
     ),
     "world_drift": FindingWords(
         "the child's world rotates by {deg_per_minute:.2g} deg and moves by {m_per_minute:.2g} m a "
-        "minute against the parent's: at {percent:.2g} % of the sensor's speed",
-        "use the poses before that correction, in the frame of the odometry",
+        "minute against the parent's, which is {percent:.2g} % of the sensor's speed",
+        "use the poses in the frame of the odometry, before any correction by a map",
         "a map that is corrected bit by bit, a heading that drifts, or poses published in a frame "
         "that moves",
         severity=Severity.WARNING,
@@ -358,15 +360,15 @@ WORDS = {
         "topics that were remapped, or files whose names were mixed up",
     ),
     "parts_turned": FindingWords(
-        "two parts of the recording are sound by themselves, and their rotations differ by {size}",
+        "two parts of the recording are consistent, but their extrinsic rotations differ by {size}",
         "calibrate each part on its own, with end {at_s:.0f} and with start {at_s:.0f}",
         "a source that started anew with other axes",
         code="mount_moved",
     ),
     "mount_moved": FindingWords(
         "the extrinsic changes {at_s:.0f} s after the start by {size}",
-        "tighten it and record again, or calibrate each part on its own, with end {at_s:.0f} and "
-        "with start {at_s:.0f}",
+        "tighten the mount and record again, or calibrate each part on its own, with end "
+        "{at_s:.0f} and with start {at_s:.0f}",
         "a mount that came loose or was knocked, or an estimator that started anew",
     ),
 }

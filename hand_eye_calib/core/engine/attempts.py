@@ -110,9 +110,9 @@ class Attempt:
         return is_improved and self.noise_fits >= other.noise_fits
 
     def with_findings(self, findings: Collection[Finding]) -> "Attempt":
-        """Return the attempt with other findings.
+        """Return the attempt with other findings, after the choice of a reading.
 
-        If both readings (poses or inverse poses) were possible, the result no longer contains this.
+        The check of the attempt no longer contains two readings (poses or inverse poses).
         """
         sorted_findings = gravest_first(tuple(findings))
         return replace(
@@ -123,11 +123,9 @@ class Attempt:
 
     def with_doubts(self, doubts: Collection[Finding]) -> "Attempt":
         """Return the attempt with further findings about options that were set automatically."""
-        return (
-            self.with_findings((*self.check.findings, *doubts))
-            if doubts
-            else self
-        )
+        if not doubts:
+            return self
+        return self.with_findings((*self.check.findings, *doubts))
 
     def with_messages(
         self, options: Options, messages: Collection[OptionMessage]

@@ -185,6 +185,7 @@ class Calibrator:
         self._drop_pairs()
 
     def _drop_pairs(self) -> None:
+        """Drop all pose pairs and the estimated time offset. Poses in the buffers are kept."""
         self._kept_parts = [PosePairs.empty()]
         self._paired_at: str | None = None
         self._time_offset: TimeOffset | None = None
@@ -385,6 +386,7 @@ class Calibrator:
                 self._kept_parts = [
                     snapshots.downsample(self._kept, config.max_pairs)
                 ]
+        # One stream begins after this batch, so the poses of the other stream cannot be paired.
         is_alone = (
             max(parent.stamps_ns[0], child.stamps_ns[0] + offset_ns)
             > horizon_ns

@@ -56,6 +56,7 @@ _MAX_JUMP_SHARE = 0.25
 
 
 def _zero_covariance() -> FloatArray:
+    """Return a covariance (6, 6) of zero."""
     return np.zeros((6, 6))
 
 
@@ -486,8 +487,8 @@ def _motion_pairs(pose_pairs: PosePairs, reference: str) -> MotionPairs:
     pairs = motion_pairs(pose_pairs.Ts_pw_p, pose_pairs.Ts_cw_c, reference)
     if len(pairs) == 0:
         raise NotEnoughDataError(
-            f"reference {reference} needs more than {reference[1:] or 1} common poses; "
-            f"{len(pose_pairs)} are there"
+            f"reference {reference} needs more than {reference[1:] or 1} common poses, found "
+            f"{len(pose_pairs)}; record longer, or choose a reference over fewer poses"
         )
     return pairs
 

@@ -54,12 +54,15 @@ def check(
         result, it uses the time offset and the scale of the options if they are numbers.
     """
     config = snapshot.config
+    time_offset_s = config.given_time_offset_s
+    scale = config.given_scale
+    if calibration:
+        time_offset_s = calibration.time_offset_s
+        scale = calibration.scale
     result = checking.check_streams(
         *snapshot.streams,
-        time_offset_s=calibration.time_offset_s
-        if calibration
-        else config.given_time_offset_s,
-        scale=calibration.scale if calibration else config.given_scale,
+        time_offset_s=time_offset_s,
+        scale=scale,
         max_gap_s=snapshot.max_gap_s,
         correlate=lambda: snapshot.correlation,
         earlier=_extrinsic_estimate(calibration),
@@ -76,12 +79,9 @@ def check(
     findings = answered(findings, config)
     if INVERSIONS & config.given:
         # The user has decided whether both streams are inverse.
-        findings = [
-            replace(finding, severity=Severity.NOTE)
-            if finding.code == "inverse_both"
-            else finding
-            for finding in findings
-        ]
+        for index, finding in enumerate(findings):
+            if finding.code == "inverse_both":
+                findings[index] = replace(finding, severity=Severity.NOTE)
     return replace(
         result,
         findings=gravest_first(findings),

@@ -227,7 +227,7 @@ def _unclear(
     texts = []
     for reading_options, answer in zip(options, answers, strict=True):
         values = options_in_words(reading_options)
-        reading = f"with {values}" if values else "as the streams are"
+        reading = f"with {values}" if values else "without options"
         pose = _pose_text(answer.T_parent_child) if answer else "no result"
         texts.append(f"{reading} ({pose})")
     code = "inverse" if options[0] else "inverse_both"

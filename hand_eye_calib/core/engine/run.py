@@ -222,19 +222,19 @@ def _reading_of(
     snapshot: Snapshot,
     result: CheckResult,
     settled: Collection[str],
-    known_s: float,
+    applied_s: float,
 ) -> _Reading:
     """Choose between poses and inverse poses in both streams, if both fit equally well.
 
-    ``settled`` are options that must not be changed. ``known_s`` is the time offset (s) that was
-    applied before the check, to which the check may have added an estimate.
+    ``settled`` are options that must not be changed. ``applied_s`` is the time offset (s) that was
+    applied before the check. The check may have estimated a further offset.
     """
     if INVERSIONS & snapshot.config.given.union(settled):
         return _Reading(_without_readings(result))
     if not result.readings:
         return _Reading(result.findings)
     further_s = result.offset.seconds if result.offset else 0.0
-    clock: Options = {"time_offset": known_s + further_s}
+    clock: Options = {"time_offset": applied_s + further_s}
 
     def pairs_of(options: Options) -> PosePairs:
         return with_options(snapshot, {**options, **clock}).pose_pairs
@@ -267,7 +267,7 @@ def _without_readings(result: CheckResult) -> tuple[Finding, ...]:
 
 
 def _repaired_unsolved(snapshot: Snapshot) -> Attempt | None:
-    """Repair streams that cannot be solved without it. Return None if no repair is certain."""
+    """Repair streams that cannot be solved otherwise. Return None if no repair is certain."""
     result = check(snapshot)
     reading = _reading_of(
         snapshot, result, (), snapshot.config.given_time_offset_s
@@ -325,7 +325,7 @@ def _repaired(
     if any(map(_contradicts_repair, second.check.findings)):
         return None
     verdict = second.calibration.verdict.value
-    verdicts = f": {verdict}; as the streams are: {verdict_as_given}"
+    verdicts = f": {verdict}; without the repair: {verdict_as_given}"
     faults = [
         finding for finding in findings if {*finding.options} & {*options}
     ]
@@ -409,14 +409,10 @@ def _estimated(
     if not (second.is_better_than(first, n_fewer) or second.is_sound):
         return first
     findings = first.check.findings
-    doubts = (
-        ()
-        if "parent_scale" in fixed
-        else _unit_doubts(findings, second.calibration)
-    )
-    return _with_estimate_warnings(second, options, findings).with_doubts(
-        doubts
-    )
+    second = _with_estimate_warnings(second, options, findings)
+    if "parent_scale" in fixed:
+        return second
+    return second.with_doubts(_unit_doubts(findings, second.calibration))
 
 
 def _unit_doubts(
@@ -512,10 +508,10 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
             raise
         calibration = None
     result = check(snapshot, calibration)
-    known_s = snapshot.config.given_time_offset_s
+    applied_s = snapshot.config.given_time_offset_s
     if calibration:
-        known_s = calibration.time_offset_s
-    reading = _reading_of(snapshot, result, (), known_s)
+        applied_s = calibration.time_offset_s
+    reading = _reading_of(snapshot, result, (), applied_s)
     findings = gravest_first((*reading.findings, *reading.doubts))
     estimates = {"time_offset", "scale"} & {
         *_certain(findings, snapshot.config.given)

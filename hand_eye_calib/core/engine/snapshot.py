@@ -176,9 +176,9 @@ class Snapshot:
         """
         parent = _corrected(self.buffered_parent, "parent", self.config)
         child = _corrected(self.buffered_child, "child", self.config)
-        return parent, self.time_offset.steadied(
-            child
-        ) if self.time_offset else child
+        if self.time_offset:
+            child = self.time_offset.steadied(child)
+        return parent, child
 
     @cached_property
     def resolved(self) -> "Snapshot":
@@ -331,14 +331,14 @@ class Snapshot:
         counts = f"{len(parent)} parent and {len(child)} child poses"
         if common_s < 0:
             offset_s = float(self.config.time_offset)
-            before, after = self.unpaired
-            overlap_s = min(before.stamps_ns[-1], after.stamps_ns[-1]) - max(
-                before.stamps_ns[0], after.stamps_ns[0]
-            )
-            if offset_s and overlap_s > 0:
+            _, recorded_child = self.unpaired
+            overlap_ns = min(
+                parent.stamps_ns[-1], recorded_child.stamps_ns[-1]
+            ) - max(parent.stamps_ns[0], recorded_child.stamps_ns[0])
+            if offset_s and overlap_ns > 0:
                 return (
                     f"{needed}: after the {offset_s:g} s of time_offset the streams do not overlap "
-                    f"({counts}); leave it out, they overlap without it"
+                    f"({counts}); omit time_offset, because the streams overlap without it"
                 )
             return (
                 f"{needed}: the streams do not overlap in time ({counts}, {-common_s:.3f} s "
@@ -378,7 +378,7 @@ def _corrected(
         ):
             options = f"{stream}_invert {invert}, {stream}_quaternion {order}"
             raise ConfigError(
-                f"{options} cannot be: the {stream} measures {kind}"
+                f"{options} cannot be: the {stream} measures {kind}; omit these options"
             )
         trajectory = replace(
             trajectory, poses=se3.put_right(trajectory.poses, invert, order)
@@ -452,8 +452,9 @@ def estimated_time_offset(
 def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
     """Return at most ``max_pairs`` of the pose pairs.
 
-    In each round, every second pair is a candidate. Candidates between whose neighbours the parent
-    rotates least are dropped. The rounds end when at most ``max_pairs`` remain.
+    In each round, every second pair is a candidate. A round drops the candidates that matter least:
+    the parent rotates little between the pair before and the pair after them. The rounds end when
+    at most ``max_pairs`` remain.
     """
     while len(pose_pairs) > max_pairs:
         candidates = np.arange(1, len(pose_pairs) - 1, 2)
@@ -462,6 +463,7 @@ def downsample(pose_pairs: PosePairs, max_pairs: int) -> PosePairs:
         traces = np.einsum(
             "kij,kij->k", rotations[candidates - 1], rotations[candidates + 1]
         )
+        # Drop a tenth of ``max_pairs`` more than needed, but at most half of the candidates.
         n_drop = min(
             len(pose_pairs) - max_pairs + max_pairs // 10,
             (len(candidates) + 1) // 2,

@@ -138,7 +138,10 @@ def _has_moved(
     min_translation: float,
     min_rotation: float,
 ) -> BoolArray:
-    """Whether poses (N, 4, 4) are far from the last keyframe, by a threshold that is not zero."""
+    """Return which poses (N, 4, 4) have moved (m) or rotated (rad) enough since the last keyframe.
+
+    A threshold of zero is ignored. If both thresholds are zero, all poses count as moved.
+    """
     if max(min_translation, min_rotation) == 0.0:
         return np.ones(len(poses), dtype=bool)
     has_moved = np.zeros(len(poses), dtype=bool)

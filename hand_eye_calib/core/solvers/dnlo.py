@@ -186,8 +186,9 @@ def truncate(
     threshold : float
         c, in the unit of the costs.
     floor : float
-        d: smallest sum of the weights. It may be fractional. If fewer pairs are below c, the pairs
-        with the largest of the d smallest costs share the remainder.
+        d: smallest sum of the weights. It may be fractional. If fewer pairs are below c, the d
+        pairs with the smallest costs have weight 1. If d is fractional, or if costs are equal, the
+        pairs with the largest of these costs have equal weights below 1, so that the sum is d.
 
     Returns
     -------
@@ -208,10 +209,8 @@ def truncate(
         excess = too_few * (is_inlier.sum(axis=-1) - floor)
         if excess.any():
             is_tied = costs == largest
-            weights -= (
-                is_tied
-                * (excess / np.maximum(is_tied.sum(axis=-1), 1))[..., None]
-            )
+            n_tied = np.maximum(is_tied.sum(axis=-1), 1)
+            weights -= is_tied * (excess / n_tied)[..., None]
     n_outliers = costs.shape[-1] - weights.sum(axis=-1)
     of_inliers = np.einsum("...k,...k", weights, costs)
     return weights, of_inliers + threshold * n_outliers
@@ -273,11 +272,10 @@ class _Search:
             before = objective
             # The first rivals come from subsets of the inliers, the other rivals from subsets of
             # all pairs.
-            for first, share in ((0, 1.0), (_N_PROMISING, _CLEARLY_SMALLER)):
-                rival = first + int(
-                    np.argmin(objectives[first : first + _N_PROMISING])
-                )
-                if objectives[rival] < share * objective:
+            for first, limit in ((0, 1.0), (_N_PROMISING, _CLEARLY_SMALLER)):
+                of_kind = objectives[first : first + _N_PROMISING]
+                rival = first + int(np.argmin(of_kind))
+                if objectives[rival] < limit * objective:
                     best = rivals[[rival]]
                     objective = objectives[rival]
             if objective >= before * (1 - _MIN_GAIN_OF_RIVALS):

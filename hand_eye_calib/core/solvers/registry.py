@@ -109,7 +109,8 @@ class Method:
         """
         if len(pairs) == 0:
             raise NotEnoughDataError(
-                "no motion pairs: there are too few common poses for the chosen reference"
+                "no motion pairs: there are too few common poses for the chosen reference; record "
+                "longer, or choose a reference over fewer poses, such as B1"
             )
         solve = _SOLVERS[self.name].solve
         if self.backend == "ipopt":

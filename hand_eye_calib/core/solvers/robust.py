@@ -240,11 +240,8 @@ def _weights(
     """Return the Cauchy weights (2, K) of translations and of rotations."""
     squared = []
     for component, scale in zip(components, scales, strict=True):
-        squared.append(
-            (component.residuals**2).sum(axis=1)
-            / 3.0
-            / (_CAUCHY_UNIT * scale) ** 2
-        )
+        mean_squares = (component.residuals**2).sum(axis=1) / 3.0
+        squared.append(mean_squares / (_CAUCHY_UNIT * scale) ** 2)
     return robust_weights("cauchy", np.array(squared))
 
 
@@ -294,11 +291,8 @@ def _covariance(
     # motions without overlap, the factor n / (n - 6) corrects this.
     n_motions = n_poses / motion
     n_free = max(n_motions - 6.0, 1.0)
-    return (
-        n_motions
-        / n_free
-        * _sandwich(hessian - curvature, scores.sum(axis=0), window)
-    )
+    covariance = _sandwich(hessian - curvature, scores.sum(axis=0), window)
+    return n_motions / n_free * covariance
 
 
 def _sandwich(
