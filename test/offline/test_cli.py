@@ -448,7 +448,7 @@ def test_a_file_that_is_given_twice_is_refused(run, command):
     code, out, err = run(*command, "camera.tum", "camera.tum")
     assert (code, out) == (2, "")
     assert (
-        "error: camera.tum appears twice: pass the file of each sensor" in err
+        "error: camera.tum appears twice: pass one file for each sensor" in err
     )
 
 

@@ -115,7 +115,7 @@ def parsed(options):
         (["fly"], "invalid choice: 'fly'"),
         (
             ["calibrate", str(ROOT / "README.md")],
-            "is one trajectory file: pass those of two",
+            "is one trajectory file: pass the files of two",
         ),
         (
             ["calibrate", "a.tum", "b.mcap"],

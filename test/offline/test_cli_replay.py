@@ -104,7 +104,10 @@ def test_journals_are_recordings_of_their_own(run, bag, tmp_path, no_processes):
     code, out, err = run(
         tmp_path / "live", bag, "--reference", "B5", "--json", "--jobs", "1"
     )
-    assert "is a session of its own; they give one result" in err
+    assert (
+        "is a recording of its own; all are used as recordings of one rig"
+        in err
+    )
     assert (code, len(json.loads(out)["together"]["recordings"])) == (0, 2)
 
 

@@ -298,7 +298,7 @@ def test_positions_are_along_the_axes_of_the_other_sensor_and_have_their_path(
     assert "computed from the poses of antenna and the result" in page.text
     match = re.search(r"within ([\d.]+) (c?m) of each other", page.text)
     assert float(match[1]) * {"cm": 0.01, "m": 1.0}[match[2]] < 0.5
-    pattern = r"less than ([\d.]+) (c?m) with the result, and by less than ([\d.]+) (c?m) without"
+    pattern = r"below ([\d.]+) (c?m) with the result, and below ([\d.]+) (c?m) without"
     after, unit_after, before, unit_before = re.search(
         pattern, page.text
     ).groups()

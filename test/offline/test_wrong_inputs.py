@@ -16,7 +16,7 @@ from hand_eye_calib.formats.files import local_path
 # Exit code, command, and a part of the answer.
 TABLE = """
 2 | calibrat lidar.tum camera.tum | did you mean calibrate?
-2 | calibrate lidar.tum | lidar.tum is one trajectory file: pass those of two sensors
+2 | calibrate lidar.tum | lidar.tum is one trajectory file: pass the files of two sensors
 2 | calibrate lidar.tum lidar.tum | lidar.tum appears twice
 1 | calibrate lidr.tum camera.tum | did you mean lidar.tum?
 2 | calibrate sample:lidr.tum camera.tum | no sample:lidr.tum; the samples are arm.yaml, camera.tum
@@ -35,7 +35,7 @@ TABLE = """
 1 | calibrate nan.tum camera.tum | all 600 rows are empty, zero or not finite
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
-1 | calibrate lidar.tum nohead.csv | name the 4 with --child-columns
+1 | calibrate lidar.tum nohead.csv | name the 4 columns with --child-columns
 1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set
 1 | calibrate lidar.tum camera.tum few0.tum | few0 (child) with lidar (parent): 10 synchronised
 1 | calibrate lidar.tum half.tum half2.tum | half and half2 have 0 poses at common times
@@ -51,7 +51,7 @@ TABLE = """
 1 | calibrate degrees.csv camera.tum | yaw_rad reaches 358.8, more than one turn (2 pi rad)
 1 | calibrate tilt.csv camera.tum | pitch_rad reaches 12, more than one turn
 1 | calibrate cells.tum camera.tum | for the timestamp
-1 | calibrate nohead.csv camera.tum | name the 4 with --parent-columns, such as t,wx,wy,wz
+1 | calibrate nohead.csv camera.tum | name the 4 columns with --parent-columns, such as t,wx,wy,wz
 1 | calibrate kitti.txt camera.tum --parent-times times.txt | 20 poses, but times.txt has 2 stamps
 1 | calibrate image.png camera.tum | image.png: not a text file
 1 | calibrate folder | no bag in folder: expected files that end in
@@ -169,8 +169,8 @@ TABLE = """
 1 | calibrate saved | a saved result, not a recording: display it with hand_eye_calib info saved
 1 | check saved | a saved result, not a recording: display it with hand_eye_calib info saved
 1 | calibrate saved/extrinsic.yaml | display it with hand_eye_calib info saved/extrinsic.yaml
-2 | lidar.tum camera.tum | a command comes first: hand_eye_calib calibrate lidar.tum camera.tum
-1 | compare saved | or one and the installed transform (--with
+2 | lidar.tum camera.tum | put a command before it: hand_eye_calib calibrate lidar.tum camera.tum
+1 | compare saved | to compare one result with the installed transform, add --with
 1 | compare saved saved | saved appears twice: name each result once
 1 | compare saved --with other.json | in it; pass extrinsic.yaml, a URDF, a bag, or "X Y
 1 | compare saved --with lidar.tum | an installed transform is one pose
@@ -211,10 +211,10 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --foo | unknown '--foo' (
 2 | calibrate lidar.tum camera.tum -o x | unknown '-o'; did you mean --out? (
 2 | calibrate lidar.tum camera.tum --mathod park | did you mean --method?
-1 | calibrate lidar.tum camera.tum --time-offset 1000 | leave it out, they overlap without it
+1 | calibrate lidar.tum camera.tum --time-offset 1000 | the streams overlap without it
 1 | calibrate lidar.tum saved/extrinsic.yaml | extrinsic.yaml is a saved result, not a
 1 | calibrate lidar.tum saved | a saved result, not a recording: display it with
-2 | saved | a command comes first: hand_eye_calib info saved
+2 | saved | put a command before it: hand_eye_calib info saved
 2 | replay lidar.tum camera.tum | trajectory files: hand_eye_calib calibrate lidar.tum camera.tum
 2 | watch lidar.tum | watch takes no file: it displays the running node
 2 | calibrate "lidar.tum camera.tum" | leave out the quotes and commas: lidar.tum camera.tum

@@ -94,7 +94,7 @@ IN_PYTHON = {
     ),
     "one result": (
         lambda: hec.compare([RESULT]),
-        "or one and the installed transform",
+        "to compare one result with the installed transform",
     ),
 }
 

@@ -49,7 +49,7 @@ class SeveralRecordingsError(InputError):
 
     def __init__(self, reason: str, groups: list[list[Path]]) -> None:
         super().__init__(
-            f"{reason}; calibrate each by itself, or all of one rig together"
+            f"{reason}; calibrate each recording by itself, or all recordings of one rig together"
         )
         self.reason = reason
         self.groups = groups
@@ -73,7 +73,7 @@ def read_recording(
     options : mapping
         Options that the user has set.
     without : collection of str
-        Names of the measurements without motion that are switched off.
+        Names of the measurements that need no motion and are switched off.
     span : Span
         Part of the recording to use.
 
@@ -88,7 +88,8 @@ def read_recording(
     journal = journals[0] if journals else None
     if journal and len(paths) > 1:
         raise SeveralRecordingsError(
-            f"{journal} is a session of its own", [[path] for path in paths]
+            f"the journal {journal} is a recording of its own",
+            [[path] for path in paths],
         )
     if journal is None:
         recording = _read_bags(

@@ -144,7 +144,7 @@ def _add_installed(parser: argparse.ArgumentParser) -> None:
 
 
 def _matching_paths(patterns: Sequence[Any]) -> list[Any]:
-    """Return the paths that match patterns with ``*``."""
+    """Return the paths that match patterns with ``*``; a URL (text) stays a text."""
     from hand_eye_calib.formats.bags.patterns import matching
 
     return [
@@ -155,6 +155,7 @@ def _matching_paths(patterns: Sequence[Any]) -> list[Any]:
 
 
 def _refuse_repeated_labels(labels: Sequence[str]) -> None:
+    """Raise a ConfigError if the name of a label appears twice."""
     for name in labels:
         if labels.count(name) > 1:
             raise ConfigError(f"--label {name} was given twice; keep one")
@@ -222,7 +223,7 @@ def _run_locally(
             )
         except bags.SeveralRecordingsError as several:
             note(
-                f"{several.reason}; they give one result, as recordings of one rig"
+                f"{several.reason}; all are used as recordings of one rig, and give one result"
             )
             _refuse_result_files(arguments)
             return SEVERAL_RECORDINGS["one rig"](arguments, several.groups)
@@ -297,17 +298,17 @@ def _described_topics(bag: "PoseBag") -> list["Document"]:
     rows = []
     for topic in bag.topics.values():
         beside_motion, frame = measured.get(topic.name, ("", ""))
-        rate_hz = (
-            (topic.count - 1) / (bag.duration_s or 1.0)
-            if topic.count > 1
-            else None
-        )
+        rate_hz = None
+        if topic.count > 1:
+            rate_hz = (topic.count - 1) / (bag.duration_s or 1.0)
+        frames = bag.edges_on(topic.name)
+        if not frames:
+            frames = _sensor_frames(bag, topic.name, frame)
         rows.append(
             {
                 **topic._asdict(),
                 "rate_hz": rate_hz,
-                "frames": bag.edges_on(topic.name)
-                or _sensor_frames(bag, topic.name, frame),
+                "frames": frames,
                 "is_usable": topic.type in MESSAGE_TYPES,
                 "quantity": quantities.get(topic.type, ""),
                 "measures": beside_motion,

@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _to_solve(finding: "Finding") -> "Finding":
-    """Return a finding with the options with which a calibration repairs the streams."""
+    """Replace the options of a finding by the options that repair the streams in a calibration."""
     from hand_eye_calib.core.engine.run import options_to_solve
 
     return replace(finding, options=options_to_solve(finding))
@@ -198,14 +198,16 @@ def _verdict(findings: "Sequence[Finding]") -> str:
         finding for finding in findings if finding.severity.value != "note"
     ]
     if not serious:
-        return "No fault found in these streams; calibrate states how good the result is."
+        return "No fault found in these streams; run calibrate to see how good the result is."
     errors = [finding for finding in serious if finding.makes_unusable]
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
     if all(finding.options for finding in serious):
         typed = " ".join(
             typed_options(finding.options.items()) for finding in serious
         )
-        return f"{verdict.value} as they are: calibrate with {typed}."
+        return (
+            f"{verdict.value} these streams unchanged: calibrate with {typed}."
+        )
     codes = ", ".join(finding.code for finding in errors or serious)
     return f"{verdict.value}: check these findings first: {codes}."
 

@@ -110,7 +110,7 @@ def exit_code_of(run: Callable[[], int]) -> int:
         if error.filename is None:
             raise
         name = shown_value(error.filename)
-        return fail(f"cannot use {name}: {error.strerror}; choose another")
+        return fail(f"cannot use {name}: {error.strerror}; choose another path")
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
 
@@ -178,7 +178,7 @@ def _unknown_command(word: str, argv: Sequence[str]) -> str:
     if word == "version":
         return "write hand_eye_calib --version"
     if line := calibrating(argv):
-        return f"{word!r} is a path; a command comes first: {line}"
+        return f"{word!r} is a path; put a command before it: {line}"
     known = ", ".join(COMMANDS)
     hint = did_you_mean(word, COMMANDS)
     return f"invalid choice: {word!r}, expected one of {known}{hint}"

@@ -138,6 +138,7 @@ def command_with(typed: Sequence[str], options: Options) -> str:
     options : mapping
         Further options by their public names, and their values.
     """
+    # Name, space and value of each further option, as typed.
     added = [typed_options([pair]).partition(" ") for pair in options.items()]
     replaced = {_flag_with_axis(name, value) for name, _, value in added}
     kept = []
@@ -306,18 +307,19 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         if meta["unit"] == "rad":
             unit = " Unit: rad, or typed as in 0.3deg."
         default = "" if field.default == "" else f" Default: {field.default}."
-        value = "|".join(
-            [*meta["words"], flag(name).rpartition("-")[2].upper()]
-        )
-        (group if name in _COMMON else rare).add_argument(
+        if meta["choices"]:
+            metavar = f"{{{','.join(meta['choices'])}}}"
+        else:
+            last_word = flag(name).rpartition("-")[2].upper()
+            metavar = "|".join([*meta["words"], last_word])
+        owner = group if name in _COMMON else rare
+        owner.add_argument(
             f"--{flag(name)}",
             dest="options",
             action="append",
             default=[],
             type=argument_type(partial(checked_option, name), f"{name} "),
-            metavar=f"{{{','.join(meta['choices'])}}}"
-            if meta["choices"]
-            else value,
+            metavar=metavar,
             help=f"{meta['doc']}{unit}{default}".replace("%", "%%"),
         )
     add = group.add_argument

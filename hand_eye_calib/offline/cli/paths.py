@@ -77,7 +77,7 @@ def misplaced(
 ) -> str:
     """Return the error about the first unused argument of a command, if its purpose is clear.
 
-    ``flags`` are the options before it that take no value.
+    ``rest`` has the unused arguments, and ``flags`` the options of the command as typed.
     """
     first = rest[0]
     if first.startswith("-"):
@@ -88,7 +88,9 @@ def misplaced(
             f"> {shlex.quote(first)}"
         )
     if re.match(rf"({'|'.join(AXIS_UNITS)})=", first):
-        return f"{first} follows no option: repeat --prior before each axis"
+        return (
+            f"{first} has no option before it: repeat --prior before each axis"
+        )
     if command == "watch" and Path(first).exists():
         return (
             "watch takes no file: it displays the running node; for files: hand_eye_calib "

@@ -100,18 +100,18 @@ def deliver(
         calibration = _with_robot(calibration, arguments, bag)
     if arguments.label:
         inputs = inputs | {"labels": dict(arguments.label)}
-    written = (
-        _saved(calibration, arguments.out, inputs) if arguments.out else ""
-    )
-    steps = (
-        () if arguments.json else next_steps(calibration, arguments, snapshot)
-    )
+    note_about_files = ""
+    if arguments.out:
+        note_about_files = _saved(calibration, arguments.out, inputs)
+    document = None
+    steps: Sequence[str] = ()
+    if arguments.json:
+        document = calibration.to_dict() | {"inputs": inputs}
+    else:
+        steps = next_steps(calibration, arguments, snapshot)
     is_scale_free = snapshot is not None and snapshot.config.scale in (
         "estimate",
         "auto",
-    )
-    document = (
-        calibration.to_dict() | {"inputs": inputs} if arguments.json else None
     )
     try:
         lines = as_lines(calibration, steps, arguments.verbose, is_scale_free)
@@ -119,7 +119,7 @@ def deliver(
     # Write the report even if stdout was closed.
     finally:
         if arguments.out:
-            note(written)
+            note(note_about_files)
         if arguments.out and calibration.motion_residuals:
             from hand_eye_calib.offline.cli.reporting import write_report
 
@@ -181,7 +181,8 @@ def _with_robot(
         tree = frames_of_bag(bag)
     else:
         raise ConfigError(
-            "--base-frame needs --installed ROBOT.urdf: a description with the frame"
+            "--base-frame needs --installed ROBOT.urdf: a description of the robot that has this "
+            "frame"
         )
     T_base_parent = tree.pose(base, calibration.parent_frame)
     return replace(calibration, base_frame=base, T_base_parent=T_base_parent)
@@ -502,7 +503,7 @@ def compact_lines(
 def _column(
     numbers: Mapping[str, str], axes: Sequence[str], width: int
 ) -> list[str]:
-    """Return the column of three axes. A text about all of them is in the second row."""
+    """Return three rows for three axes. A text about all three axes is in the second row."""
     if text := numbers.get(listing(axes)):
         return ["", f"{listing(axes)} are {text}", ""]
     return [f"{axis:<{width}} {numbers[axis]:>24}" for axis in axes]

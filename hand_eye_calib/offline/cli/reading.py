@@ -127,7 +127,8 @@ def are_bags(paths: Sequence[Path | str]) -> bool:
             )
     if len(paths) == 1:
         raise ConfigError(
-            f"{paths[0]} is one trajectory file: pass those of two sensors, PARENT CHILD, or a bag"
+            f"{paths[0]} is one trajectory file: pass the files of two sensors, PARENT CHILD, or a "
+            "bag"
         )
     return False
 
@@ -137,7 +138,7 @@ def refuse_repeated_paths(paths: Sequence[Path | str]) -> None:
     for path, count in Counter(map(str, paths)).items():
         if count > 1:
             raise ConfigError(
-                f"{path} appears twice: pass the file of each sensor, a bag only once"
+                f"{path} appears twice: pass one file for each sensor, or a bag once"
             )
 
 
@@ -184,10 +185,12 @@ def read_pair(arguments: Namespace, options: Options) -> Recording:
             "first_stamp_ns": int(poses.stamps_ns[0]),
             "last_stamp_ns": int(poses.stamps_ns[-1]),
         }
-    times = {arguments.times, arguments.parent_times, arguments.child_times} - {
-        None
+    stamp_files = {
+        arguments.times,
+        arguments.parent_times,
+        arguments.child_times,
     }
-    paths = [*map(Path, arguments.paths), *times]
+    paths = [*map(Path, arguments.paths), *(stamp_files - {None})]
     parent, child = files.trajectories
     snapshot = whole_snapshot(parent, child, options)
     return Recording(snapshot, inputs, paths, tuple(files.warnings))
@@ -281,9 +284,9 @@ def span_from(arguments: Namespace) -> Span:
 def _with_option_of_file(
     text: str, paths: Sequence[Path | str], streams: Sequence[str]
 ) -> str:
-    """Return a message that begins with a path, with the options of the file in `columns`' place.
+    """Return a message with the option of one file, such as `parent_columns` for `columns`.
 
-    If the file has a stream, the message contains the option of this file instead of both files.
+    The file is the one whose path begins the message. Without a stream, the message is unchanged.
     """
     for path, stream in zip(paths, streams, strict=True):
         if stream and text.startswith(str(path)):

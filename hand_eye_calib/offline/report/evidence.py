@@ -184,13 +184,14 @@ def gather(calibration: Calibration, snapshot: Snapshot) -> Evidence:
             parent_path, child_path = measured, computed
     else:
         parent_path, child_path = _paths_of_poses(calibration, pose_pairs)
+    angles = None
+    if calibration.measured == "poses":
+        angles = _angles(calibration, pose_pairs)
     return Evidence(
         times_s=(pose_pairs.stamps_ns - pose_pairs.stamps_ns[0]) * 1e-9,
         parent=parent_path,
         child=child_path,
-        angles=_angles(calibration, pose_pairs)
-        if calibration.measured == "poses"
-        else None,
+        angles=angles,
         excitation=excitation(oriented),
         streams=view_streams(parent, shifted, config.max_gap),
         without_lever_arm=without_lever_arm,
@@ -312,9 +313,9 @@ def turning_part(
 ) -> slice:
     """Return the part of a path (N, 3) in which the sensor turns most.
 
-    It is the part with the largest ratio of its length to the distance of its ends. Parts shorter
-    than half of the median length are left out. Its duration is a tenth of the path's duration, and
-    at least ``least_s``.
+    All parts have equal durations: a tenth of the path's duration, and at least ``least_s``. The
+    returned part has the largest ratio of its length to the distance of its ends. Parts shorter
+    than half of the median length are left out.
     """
     duration_s = max(times_s[-1] / 10, least_s)
     ends = np.searchsorted(times_s, times_s + duration_s)
@@ -331,9 +332,8 @@ def turning_part(
     lengths = travelled[ends] - travelled[starts]
     chords = np.linalg.norm(path[ends] - path[starts], axis=1)
     is_long = 2 * lengths >= median(lengths)
-    row = int(
-        np.argmax(np.where(is_long, lengths / (chords + 0.1 * lengths), 0.0))
-    )
+    ratios = np.where(is_long, lengths / (chords + 0.1 * lengths), 0.0)
+    row = int(np.argmax(ratios))
     return slice(int(starts[row]), int(ends[row]) + 1)
 
 

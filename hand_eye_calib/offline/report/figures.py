@@ -202,9 +202,7 @@ def figure_of_streams(view: StreamView, names: tuple[str, str]) -> Drawn:
         difference = (
             length(view.difference) if is_speed else angle(view.difference)
         )
-        comparison = (
-            f"Here they differ by less than {difference}/s half of the time."
-        )
+        comparison = f"Here the rates differ by less than {difference}/s half of the time."
     caption = (
         f"{_WHY_EQUAL[view.quantity]} {comparison} The bars below the curves show when there is "
         "data."
@@ -276,12 +274,15 @@ def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     farthest_s = evidence.times_s[int(np.argmax(distances_m))]
     caption = (
         f"The path of {own}, and the same path computed from the poses of "
-        f"{other} and the result. Half of the time they are within "
-        f"{length(float(np.median(distances_m)))} of each other, and at most "
-        f"{length(distances_m.max())} apart, at {farthest_s * factor:.1f} {unit}."
+        f"{other} and the result. Half of the time both paths are within "
+        f"{length(float(np.median(distances_m)))} of each other. The largest distance is "
+        f"{length(distances_m.max())}, at {farthest_s * factor:.1f} {unit}."
     )
     if calibration.verdict is not Verdict.DO_NOT_USE:
-        caption += " That is mostly drift and jumps of the odometry, not an error of the result."
+        caption += (
+            " These distances are mostly drift and jumps of the odometry, not an error of the "
+            "result."
+        )
     caption += " The dot is the start."
     lines, _ = plane.get_legend_handles_labels()
     title = "Both trajectories, aligned"
@@ -343,7 +344,7 @@ def _figure_of_coordinates(
         f"Position of {parent}, and the angles by which it has turned about its own axes since the "
         f"first pose: as measured, and computed from the poses of {child} and the result. Half of "
         f"the time, both poses differ by less than {length(float(np.median(distances_m)))} and "
-        f"{angle(float(np.median(angles_rad)))}. That includes drift."
+        f"{angle(float(np.median(angles_rad)))}. The differences include drift."
     )
     title = "Both streams over time, aligned"
     return as_drawn(figure, "coordinates", title, caption, lines)
@@ -421,7 +422,7 @@ def _figure_of_track(
     caption = (
         f"A turn of the track, enlarged. Dots: measured positions of {sensor}. The line "
         f"computed from the poses of {other} and the result should go through the dots. Half of "
-        f"the time, it is within {distances[1]} of them; without a lever arm, within "
+        f"the dots are within {distances[1]} of this line; without a lever arm, within "
         f"{distances[0]}."
     )
     lines, _ = plane.get_legend_handles_labels()
@@ -453,8 +454,8 @@ def _figure_of_positions(
     after_m = length(float(np.median(np.linalg.norm(after, axis=1))))
     caption = (
         f"Left: the measured positions of {sensor}. Right: the positions computed from the poses "
-        f"of {other}, less the measured ones. Half of the time, they differ by less than {after_m} "
-        f"with the result, and by less than {before_m} without a lever arm. That includes drift."
+        f"of {other}, minus the measured positions. Half of the differences are below {after_m} "
+        f"with the result, and below {before_m} without a lever arm. They include drift."
     )
     title = "Positions over time, before and after"
     return as_drawn(figure, "coordinates", title, caption, lines)
@@ -509,11 +510,9 @@ def _figure_of_residuals(
     largest = [
         amount(axis, float(np.max(values))) for axis, values in sizes.items()
     ]
-    n_out = (
-        f"{is_out.sum():,} ({share(float(is_out.mean()))})"
-        if is_out.any()
-        else "None"
-    )
+    n_out = "None"
+    if is_out.any():
+        n_out = f"{is_out.sum():,} ({share(float(is_out.mean()))})"
     caption = (
         f"Half of the {len(residuals):,} {items} agree with the result to {listing(medians)}, all "
         f"of them to {listing(largest)}. {n_out} of them are {outliers}."

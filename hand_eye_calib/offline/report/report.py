@@ -450,11 +450,9 @@ def _data(
     if evidence:
         kind = f"synchronised pose pairs over {text.duration(evidence.times_s[-1])}"
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    streams = (
-        dict(zip(("parent", "child"), snapshot.streams, strict=True))
-        if snapshot
-        else {}
-    )
+    streams: dict[str, Trajectory] = {}
+    if snapshot:
+        streams = dict(zip(("parent", "child"), snapshot.streams, strict=True))
     rows = []
     for name in ("parent", "child", "samples"):
         if name in streams or name in inputs:
