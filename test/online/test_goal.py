@@ -178,7 +178,7 @@ def test_the_motion_of_the_last_minute_counts_if_it_is_better():
     )
     assert progress.axes["z"].seconds_left == pytest.approx(30.0)
     assert progress.sentence == (
-        "Go on for about 2 min, z takes longest. This motion is right, more of it."
+        "Go on for about 2 min, z takes longest. This motion is right: continue it."
     )
 
 
@@ -215,7 +215,7 @@ def test_the_motion_is_not_to_be_changed_while_the_motion_asked_for_is_driven():
     on_ramp = goal.add(hidden, seen(64.0, FLAT), newest_motion=ramp)
     assert not on_ramp.will_not_get_there
     assert on_ramp.sentence == (
-        "z is not determined well enough yet. This motion is right, more of it."
+        "z is not determined well enough yet. This motion is right: continue it."
     )
 
 

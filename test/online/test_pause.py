@@ -116,7 +116,7 @@ def test_a_stream_that_stops_pauses_the_session_and_is_named(node):
         True,
     )
     assert state.progress.text == (
-        "Paused: no pose of child (/child_odom) for 7.0 s; start its source again."
+        "Paused: no pose of child (/child_odom) for 7.0 s; start the source of the poses again."
     )
     assert (view.word, view.tone) == ("PAUSED", Tone.ACT)
     assert "/child_odom" in view.sentence

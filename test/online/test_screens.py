@@ -220,13 +220,13 @@ SCREENS = {
         axes=HEIGHT_UNKNOWN,
         extrinsic=GOOD,
         at={
-            "sentence": "z is not determined well enough yet. This motion is right, more of it.",
+            "sentence": "z is not determined well enough yet. This motion is right: continue it.",
         },
     ),
     "time left": state(
         extrinsic=GOOD,
         at={
-            "sentence": "Go on for about 90 s, z takes longest. This motion is right, more of it."
+            "sentence": "Go on for about 90 s, z takes longest. This motion is right: continue it."
         },
     ),
     "change": state(

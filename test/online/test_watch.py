@@ -476,7 +476,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert (view.bars, view.result, view.word) == ((), (), "MOUNT MOVED")
     assert (
         view.text
-        == "The mount has moved. Check it, then recalibrate or acknowledge."
+        == "The mount has moved. Check the mount, then recalibrate or acknowledge."
     )
     assert view.facts == "2 min ago; a reset ends the alarm"
     assert view.buttons[:2] == ("recalibrate", "acknowledge")
@@ -485,7 +485,7 @@ def test_a_watched_mount_has_a_line_for_each_axis_instead_of_bars():
     assert "moved by 1 deg" in drawn(view, 80)
     assert "s solve" not in drawn(view, 80)
     assert "c recalibrate   a acknowledge   r reset" in drawn(view, 80)
-    assert '<p class="advice">Check it, then' in fragment(view)
+    assert '<p class="advice">Check the mount, then' in fragment(view)
     assert view_of(mount(level=Level.WARN)).watched[0].text == "not known yet"
 
 

@@ -279,7 +279,10 @@ def test_the_end_of_a_node_with_a_refuted_result_is_no_success(
     assert (view.word, view.tone) == ("ENDED", Tone.BAD)
     cause = "DO NOT USE: the value typed in for z contradicts the motion."
     assert view.sentence.startswith(f"{cause} The result was saved at ")
-    assert (view.advice, view.by_hand) == ("Mend that, and record again.", ())
+    assert (view.advice, view.by_hand) == (
+        "Mend the fault, and record again.",
+        (),
+    )
 
 
 class TestOptions:

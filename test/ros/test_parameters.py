@@ -101,7 +101,7 @@ def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
     log = node.wait_for_log(
         "parameter treshold does not exist and is ignored; did you mean threshold?",
         "parameter nonsense does not exist",
-        "set are threshold 1.0",  # written as an integer
+        "parameters: threshold 1.0",  # written as an integer
     )
     assert log.count("does not exist") == 2
     assert node.stop()[0] == 0

@@ -16,9 +16,9 @@ from hand_eye_calib.core.results.verdict import Reason
 # Most words of a sentence that a person reads aloud in one breath.
 MAX_WORDS = 15
 
-START_SOURCE = "Start its source, or correct the topic's name."
-START_SOURCE_AGAIN = "Start its source again."
-CHECK_SOURCE = "Check that its source sends poses."
+START_SOURCE = "Start the source of the poses, or correct the topic's name."
+START_SOURCE_AGAIN = "Start the source of the poses again."
+CHECK_SOURCE = "Check that the source of the topic sends poses."
 RESET_AFTER_REPAIR = "Correct the source, then reset."
 _TAPE = "Compare with a tape measure."
 
@@ -34,7 +34,7 @@ class Brief(NamedTuple):
 _OF_RULES: Mapping[str, Brief] = {
     "prior": Brief(
         "the value typed in for {axes} contradicts the motion",
-        "Correct or remove it, then reset.",
+        "Correct or remove the value, then reset.",
     ),
     "error_finding": Brief("a stream has a fault", "Read the reasons below."),
     "not_converged": Brief(
@@ -106,12 +106,12 @@ def step_after(finding: Finding) -> str:
             f"{name} to {value}" for name, value in finding.options.items()
         ]
         return in_one_breath(
-            f"Set {', '.join(settings)}.", "Set the parameters that are below."
+            f"Set {', '.join(settings)}.", "Set the parameters listed below."
         )
     if finding.makes_unusable:
         return _OF_FINDINGS.get(finding.code, RESET_AFTER_REPAIR)
     advice = in_one_breath(
-        finding.advice_on(Interface.NODE), "read the advice that is below"
+        finding.advice_on(Interface.NODE), "read the advice below"
     )
     return f"{capital(advice).rstrip('.')}."
 

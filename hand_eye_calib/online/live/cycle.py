@@ -196,11 +196,9 @@ class SolveCycle:
     @property
     def published(self) -> Calibration | None:
         """Result to publish; None if there is none, or if it is refuted."""
-        return (
-            None
-            if self.result is None or is_refuted(self.result)
-            else self.result
-        )
+        if self.result is None or is_refuted(self.result):
+            return None
+        return self.result
 
     @property
     def standing(self) -> Standing:
@@ -209,11 +207,9 @@ class SolveCycle:
             return Standing.NONE
         if is_refuted(self.result):
             return Standing.REFUTED
-        return (
-            Standing.CURRENT
-            if self._failing_since_s is None
-            else Standing.OUTDATED
-        )
+        if self._failing_since_s is None:
+            return Standing.CURRENT
+        return Standing.OUTDATED
 
     @property
     def problem(self) -> str:
@@ -472,10 +468,11 @@ class SolveCycle:
         motion = self._motion
         level, text = self._condition(accepts_poses, tf_static)
         result = None
+        contradicted: tuple[str, ...] = ()
         if self.result is not None:
-            result = state_of_result(
-                self.result, time.monotonic() - self._solved_at_s
-            )
+            age_s = time.monotonic() - self._solved_at_s
+            result = state_of_result(self.result, age_s)
+            contradicted = tuple(self.result.contradictions)
         return ExtrinsicState(
             level=level,
             text=text,
@@ -493,9 +490,7 @@ class SolveCycle:
             standing=self.standing,
             problem=self.problem,
             priors=priors_of(self._session.calibrator.config),
-            contradicted=tuple(self.result.contradictions)
-            if self.result
-            else (),
+            contradicted=contradicted,
             result=result,
         )
 

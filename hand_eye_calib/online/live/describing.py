@@ -79,7 +79,7 @@ def pause_of(
     remedy = (
         "continue to drive, or save"
         if level is Level.OK
-        else "start its source again"
+        else "start the source of the poses again"
     )
     streams = listing(
         [f"{name} ({state.topic})" for name, state in paused.items()]

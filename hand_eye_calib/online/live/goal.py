@@ -419,7 +419,7 @@ class Goal:
             sentence = f"This motion will not determine {axis_text} well enough. {motion}."
         else:
             if is_helpful:
-                motion = "This motion is right, more of it"
+                motion = "This motion is right: continue it"
             elif _turns_about(newest_motion, axis):
                 # A rotation about an axis does not observe this axis. The motion must change, so
                 # the time left with the present motion is no forecast.

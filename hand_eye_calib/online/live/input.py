@@ -380,6 +380,9 @@ class PoseInput:
             self._log.warning(f"{self.topic}: {advice}")
             level = Level.WARN
             text = f"{text}; {advice}"
+        n_publishers = None
+        if self.publishers is not None:
+            n_publishers = len(self.publishers)
         return InputState(
             level=level,
             text=text,
@@ -394,9 +397,7 @@ class PoseInput:
             },
             lost=None if self._next_number is None else self._lost,
             longest_gap_s=self._longest_gap_ns * 1e-9,
-            publishers=None
-            if self.publishers is None
-            else len(self.publishers),
+            publishers=n_publishers,
             is_paused=self.is_paused(steady_s),
             silent_s=self.silent_s(steady_s),
             step=step,

@@ -95,11 +95,9 @@ class StreamChecks:
 
     def with_open_errors(self, calibration: Calibration) -> Calibration:
         """Return a calibration whose allowance includes the open covariance of the last check."""
-        return (
-            calibration
-            if self._result is None
-            else with_open_errors(calibration, self._result)
-        )
+        if self._result is None:
+            return calibration
+        return with_open_errors(calibration, self._result)
 
     def with_findings(self, calibration: Calibration) -> Calibration:
         """Return a calibration with the findings that the session reports.

@@ -234,7 +234,7 @@ class CalibratorNode(ManagedNode):
             if name != "output_directory"
         ]
         if settings:
-            texts.append(f"set are {', '.join(settings)}")
+            texts.append(f"parameters: {', '.join(settings)}")
         if not options.enabled:
             texts.append("poses are not accepted before ~/set_enabled")
         self._log.info("; ".join(texts))
@@ -290,8 +290,9 @@ class CalibratorNode(ManagedNode):
         self._solve_timer = make_timer(
             self._options.node.solve_period, self._on_solve_timer
         )
-        # Tasks of a second, in order. Together they would delay messages on a slow computer. Every
-        # second call flushes the journal. The calls between publish first, and then discover.
+        # Each call of the timer runs one task, because all tasks of a second together would delay
+        # messages on a slow computer. Calls alternate between a flush of the journal and another
+        # task. The first other task of a second publishes; the others discover.
         flush = self._session.flush_journal
         tasks = [flush, self._publish]
         for _ in range(round(REPORT_PERIOD_S / FLUSH_PERIOD_S) - 1):
@@ -356,11 +357,9 @@ class CalibratorNode(ManagedNode):
         if not progress.done:
             return "the goal is not reached"
         base_frame = self._options.node.base_frame
-        return (
-            ""
-            if result.base_frame == base_frame
-            else f"base_frame {base_frame} is not known"
-        )
+        if result.base_frame != base_frame:
+            return f"base_frame {base_frame} is not known"
+        return ""
 
     def _state(self) -> NodeState:
         """Return the whole state of the node."""

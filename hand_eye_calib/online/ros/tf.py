@@ -106,7 +106,10 @@ class RobotTree(FrameTree):
             topic = STATIC_TOPIC if edge.is_static else DYNAMIC_TOPIC
             if edge.parent == parent:
                 return f"{topic} has the edge {parent} -> {child} already, from another node"
-            return f"{child} has the parent {edge.parent} on {topic} already, and a frame has one"
+            return (
+                f"{child} has the parent {edge.parent} on {topic} already, and a frame can have "
+                "only one"
+            )
         # The parent is unknown, or other edges form a circle.
         with contextlib.suppress(InputError):
             if child in self.above(parent):
@@ -248,7 +251,7 @@ def _with_axis_of(
     # The errors of the other axes are correlated with the error of this axis. Shift them by their
     # regression on this axis.
     T[:3, 3] += covariance[:3, index] / covariance[index, index] * missing
-    warning = f"{axis} is that of the installed transform"
+    warning = f"{axis} is taken from the installed transform: the motion does not determine it"
     return replace(
         calibration, T_parent_child=T, warnings=(*calibration.warnings, warning)
     )

@@ -158,15 +158,14 @@ class Watcher:
                 self._sources.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
-        poses = [
-            (topic, type_name)
-            for topic, types in topics
-            for type_name in types
-            if type_name in POSE_TYPES
-            and topic.rpartition("/")[0] not in self._sources
-            if topic not in self._board.inputs
-            and self._node.count_publishers(topic)
-        ]
+        poses = []
+        for topic, types in topics:
+            namespace, _, _ = topic.rpartition("/")
+            if namespace in self._sources or topic in self._board.inputs:
+                continue
+            pose_types = [name for name in types if name in POSE_TYPES]
+            if pose_types and self._node.count_publishers(topic):
+                poses += [(topic, type_name) for type_name in pose_types]
         lines = [
             self._describe(topic, type_name)
             for topic, type_name in poses[:_MAX_NAMES]

@@ -65,7 +65,7 @@ _TONES: dict[object, Tone] = {
 # States of a broadcast in words, if they differ from the values.
 _BROADCASTS = {
     Broadcast.ON: "yes, as a static transform",
-    Broadcast.WITHDRAWN: "no longer, but they keep it until they restart",
+    Broadcast.WITHDRAWN: "no longer; programs that received it keep it until they restart",
 }
 
 # The board displays the solver's reason in these states, because no newest result explains them.
@@ -156,7 +156,7 @@ class Board:
             view = replace(
                 view,
                 tone=Tone.ACT,
-                advice="Check it, then recalibrate.",
+                advice="Check the mount, then recalibrate.",
                 facts=f"{view.facts}; acknowledged",
                 buttons=("recalibrate", "reset"),
                 asked="recalibrate",

@@ -47,7 +47,7 @@ CHECK_VALUE = "CHECK THE VALUE"
 CHECK_STREAMS = "CHECK THE STREAMS"
 DONE = "DONE"
 
-_ACKNOWLEDGE = "Check it, then recalibrate or acknowledge."
+_ACKNOWLEDGE = "Check the mount, then recalibrate or acknowledge."
 
 
 class Headline(NamedTuple):
@@ -161,7 +161,7 @@ def _conditions(state: NodeState) -> Iterator[_Condition]:
             "BAD INPUT",
             Level.ERROR,
             stream,
-            "Correct its source.",
+            "Correct the source of the poses.",
             otherwise=f"messages on {stream.topic} are unusable",
         )
     yield _Condition(
@@ -198,7 +198,7 @@ def _of_priors(extrinsic: ExtrinsicState) -> _Condition:
         CHECK_VALUE,
         Level.WARN,
         extrinsic,
-        "Correct it (value, unit, sign), or remove it.",
+        "Correct the value (number, unit, sign), or remove it.",
         text=f"the value typed in for {axes} contradicts the motion",
     )
 
@@ -218,6 +218,9 @@ def _of_input(stream: InputState, state: NodeState) -> _Condition:
 
 def _of_checks(checks: ChecksState) -> _Condition:
     """Return the condition of faulty streams."""
+    otherwise = ""
+    if checks.gravest:
+        otherwise = "the streams have a fault: read the checks below"
     return _Condition(
         Tone.ACT,
         CHECK_STREAMS,
@@ -226,9 +229,7 @@ def _of_checks(checks: ChecksState) -> _Condition:
         checks.step,
         "reset" if checks.needs_reset else "",
         checks.gravest,
-        "the streams have a fault: read the checks below"
-        if checks.gravest
-        else "",
+        otherwise,
     )
 
 
@@ -396,7 +397,7 @@ def _end(state: NodeState) -> Headline:
         )
     if saved is None:
         if not state.result:
-            reason = "There was no result yet. Start it again to go on."
+            reason = "There was no result yet. Start the node again to go on."
         elif state.can_save:
             reason = "The result is not saved: the log contains the reason."
         else:
@@ -412,7 +413,7 @@ def _end(state: NodeState) -> Headline:
             Tone.BAD,
             "ENDED",
             f"{caution} {saved_text}",
-            "Mend that, and record again.",
+            "Mend the fault, and record again.",
         )
     if state.result and caution:
         return Headline(
@@ -422,7 +423,7 @@ def _end(state: NodeState) -> Headline:
         return Headline(
             Tone.ACT,
             "ENDED",
-            f"{saved_text} It was not confirmed yet.",
+            f"{saved_text} Further motion has not confirmed it yet.",
             "Record longer, until DONE.",
         )
     if moved := _moved(state):
