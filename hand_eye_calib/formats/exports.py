@@ -228,7 +228,8 @@ def _filled_layout(result: Judged, name: str) -> str:
     ]:
         raise InputError(
             "no file is written: this recording does not determine "
-            f"{axes_in_words(unknown)}; measure it by hand and calibrate again with a prior"
+            f"{axes_in_words(unknown)}; measure the missing values by hand, and calibrate again "
+            "with priors"
         )
     target, source = frames
     offset_s = result.time_offset_s

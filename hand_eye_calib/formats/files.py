@@ -193,7 +193,8 @@ def read_bytes(path: str | Path, largest: int = LARGEST) -> bytes:
     with open_regular(path) as file:
         if os.fstat(file.fileno()).st_size > largest:
             raise InputError(
-                f"cannot read {path}: it is larger than {largest} bytes"
+                f"cannot read {path}: it is larger than the limit of {largest} bytes; pass a "
+                "smaller file"
             )
         return file.read()
 

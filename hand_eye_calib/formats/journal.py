@@ -328,7 +328,7 @@ def keep_aside(directory: str | Path) -> Path:
         if not os.path.lexists(aside):
             return directory.replace(aside)
     raise OSError(
-        f"{aside} and earlier ones are no session journals; move them away"
+        f"{aside} and the folders with lower numbers are no session journals; move them away"
     )
 
 

@@ -153,12 +153,8 @@ def save_rig(
     folders = {RIG_NAME, LAUNCH_NAME, REPORT_NAME}
     for calibration in calibrations:
         # Replace characters that are not suitable for the name of a folder.
-        name = (
-            re.sub(r"[^\w.-]", "_", calibration.child_frame.strip("/")).lstrip(
-                "."
-            )
-            or "sensor"
-        )
+        frame = calibration.child_frame.strip("/")
+        name = re.sub(r"[^\w.-]", "_", frame).lstrip(".") or "sensor"
         while name in folders:
             name += "_2"
         folders.add(name)
@@ -317,7 +313,8 @@ def _result_in(folder: Path) -> Path:
             str(file.parent) for file in folder.glob(f"*/{FILE_NAME}")
         )
         raise InputError(
-            f"{folder} is of a rig; name one of its sensors: {', '.join(sensors)}"
+            f"{folder} has the results of a rig; pass the folder of one sensor: "
+            f"{', '.join(sensors)}"
         )
     if any(map(has_suffix_of_bag, folder.iterdir())):
         raise _bag_instead(folder)

@@ -236,7 +236,9 @@ class TestFiles:
     def test_four_columns_without_names_need_to_be_told(self, tmp_path):
         path = tmp_path / "data.txt"
         path.write_text("1 0 0 1\n2 0 0 1\n")
-        with pytest.raises(InputError, match="name the 4 with `columns`"):
+        with pytest.raises(
+            InputError, match="name the 4 columns with `columns`"
+        ):
             read_trajectory_file(path, "auto")
         for columns, measures in (
             ("t,wx,wy,wz", "rates"),

@@ -322,7 +322,7 @@ def test_fields_of_a_place_are_positions(bag):
         (
             "/imu+/fix",
             ConfigError,
-            "measure rates or rotations; asked for are positions",
+            "measure rates or rotations; the options ask for positions",
         ),
         (
             "/array?t=header.stamp,x=pose.position.x,y=a,z=b",

@@ -222,7 +222,10 @@ def test_the_motion_tells_which_way_an_angle_is_counted(tmp_path):
             1,
             atol=1e-12,
         )
-        assert "because the motion fits that and not the usual" in guesses[-1]
+        assert (
+            "because the motion fits this convention and not the usual one"
+            in guesses[-1]
+        )
 
 
 def test_files_with_the_same_columns_are_read_by_one_convention(tmp_path):

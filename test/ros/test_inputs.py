@@ -210,7 +210,7 @@ class TestRefusedInput:
         node.wait_for_log(
             "[ERROR]",
             "/child_odom has messages of type geometry_msgs/msg/PoseStamped, which measure poses "
-            "or positions or rotations; asked for are rates",
+            "or positions or rotations; the options ask for rates",
         )
         peer.node.destroy_publisher(wrong)
         peer.wait_matched(peer.publisher(Imu, "child_odom"))

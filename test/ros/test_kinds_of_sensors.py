@@ -210,5 +210,5 @@ def test_transforms_do_not_measure_rates(start_node, kind):
     assert node.wait() == 1
     assert node.log == (
         "calibrator: transform odom:camera has messages of type tf2_msgs/msg/TFMessage, which "
-        "measure poses or positions or rotations; asked for are rates\n"
+        "measure poses or positions or rotations; the options ask for rates\n"
     )

@@ -83,7 +83,7 @@ class _Candidate(NamedTuple):
 
     @property
     def rank(self) -> int:
-        """Index of the sensor's kind in ``_SENSORS``. Other kinds have the number of kinds."""
+        """Index of the sensor's kind in ``_SENSORS``; for other kinds, the length of the list."""
         role = role_of(self.name) or role_of(self.frame)
         return _SENSORS.index(role) if role in _SENSORS else len(_SENSORS)
 
@@ -147,7 +147,7 @@ def choose(
     ]
     groups: list[Sequence[TopicInfo | _Candidate]] = [poses, moving]
     groups += [moving + paths, moving + others, sensors, of_known_kinds]
-    # The choice is obvious if a group has the right number of topics, or of sensors.
+    # The choice is obvious if a group has as many topics, or sensors, as streams are missing.
     for group in groups:
         if len(group) == n_missing:
             return [item.name for item in group]
@@ -165,7 +165,7 @@ def _partners(
     sensors: Sequence[_Candidate],
     frame_of: Callable[[str], str],
 ) -> Sequence[TopicInfo]:
-    """Return the topics that may be the other stream of the sensors."""
+    """Return the topics that may be the second stream, beside the stream of one of ``sensors``."""
     partners = topics
     if len(sensors) == 1 and sensors[0].frame:
         # The other stream must be from another sensor.
@@ -218,11 +218,9 @@ def _unclear(
     advice = "record the odometry of the other sensor"
     if not sensors:
         advice = _advice({topic.type for topic in topics}, len(missing))
-    listed = (
-        f"The bag has {listed_usable(topics)}"
-        if topics
-        else "The bag has no other topics"
-    )
+    listed = "The bag has no other topics"
+    if topics:
+        listed = f"The bag has {listed_usable(topics)}"
     return UnclearStreamsError(f"{problem}: {advice}. {listed}", {})
 
 
@@ -260,7 +258,7 @@ def _problem_and_sources(
         listed = shortened(listing(sorted(edges)), _LONGEST_LIST)
         problem = (
             f"{no_poses}; the transforms share a frame, so they may all be from one sensor "
-            f"({listed}; if two sensors measured two of them, name these two)"
+            f"({listed}; if two sensors measured two of the transforms, name these two)"
         )
         return problem, []
     partial = _partial_topic(topics) if n_missing == 1 else None

@@ -28,9 +28,11 @@ def decoder_of(kind: MessageKind) -> Callable[[bytes], Any]:
         If the encoding or the definition of the messages is unknown.
     """
     if kind.encoding == "json":
-        return partial(
-            json.loads, object_hook=lambda fields: SimpleNamespace(**fields)
-        )
+
+        def object_of(fields: dict[str, Any]) -> SimpleNamespace:
+            return SimpleNamespace(**fields)
+
+        return partial(json.loads, object_hook=object_of)
     if kind.encoding not in ("cdr", "ros1", "protobuf"):
         raise InputError(
             f"messages of type {kind.type} have the encoding "
@@ -46,7 +48,7 @@ def decoder_of(kind: MessageKind) -> Callable[[bytes], Any]:
     except Exception as error:  # damaged definitions raise errors of many kinds
         raise InputError(
             f"the bag contains no readable definition of {kind.type}; record "
-            "it as mcap, which stores definitions"
+            "again as mcap, which stores the definitions of all types"
         ) from error
 
 

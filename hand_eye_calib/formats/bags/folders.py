@@ -132,7 +132,7 @@ def _unpack(file: Path, target: Path) -> str:
                 if n_bytes > max_bytes:
                     raise InputError(
                         f"cannot read bag {file}: it unpacks to more than "
-                        f"{files.LARGEST_RATIO} times its size; the file is damaged"
+                        f"{files.LARGEST_RATIO} times its size, so it is damaged; copy it again"
                     )
         except (EOFError, zstd.ZstdError) as error:
             return f"its compression is damaged ({reason_of(error)})"

@@ -130,7 +130,7 @@ class McapFile(Storage):
             ]
         elif self.losses:
             raise DamageError(
-                f"{self.losses[0]}, and no message before can be read"
+                f"{self.losses[0]}, and no message before the damage can be read"
             ) from reason
 
     def _messages(

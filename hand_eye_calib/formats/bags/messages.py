@@ -325,7 +325,7 @@ def measured_as(message_type: str, wanted: str, source: object) -> str:
     if not {wanted, MEASURES[wanted].read_as} & {*possible}:
         raise ConfigError(
             f"{source} has messages of type {message_type or 'tf2_msgs/msg/TFMessage'}, which "
-            f"measure {' or '.join(possible)}; asked for are {wanted}"
+            f"measure {' or '.join(possible)}; the options ask for {wanted}"
         )
     return wanted
 

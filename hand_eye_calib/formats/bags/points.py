@@ -114,6 +114,7 @@ def topics_and_frames(
         run = next(bag.runs([topic.name]), None)
         if run is None:
             continue
+        first = run._replace(messages=run.messages[:1])
         with suppress(InputError):  # a damaged message
-            message = next(run._replace(messages=run.messages[:1]).decoded())
+            message = next(first.decoded())
             yield topic.name, frame_name(message.header.frame_id)

@@ -140,7 +140,7 @@ class PoseBag:
         return f"The bag has {topics or 'no topics'}"
 
     def type_of(self, source: Source) -> str:
-        """Return the message type of a topic; empty for pairs of frames and for missing topics."""
+        """Return the message type of a topic; empty for missing topics and for pairs of frames."""
         return self.topics[source].type if source in self.topics else ""
 
     def _tf_topics(self) -> list[str]:
@@ -190,17 +190,16 @@ class PoseBag:
             return usual
         if usual not in ("poses", wanted):
             raise ConfigError(
-                f"{source} measures {usual}; asked for are {wanted}"
+                f"{source} measures {usual}, but the options ask for {wanted}"
             )
         return wanted
 
     def check(self, source: Source, taken: Sequence[Source] = ()) -> None:
         """Raise InputError if a source cannot be read. The message lists the topics of the bag.
 
-        The message does not propose ``taken``, the sources of other sensors.
-
-        A source cannot be read if its topic is missing or has no poses, or if its frames are in no
-        transform.
+        Topics that are missing or have no poses cannot be read. Pairs of frames cannot be read from
+        a bag without transforms. Where the message proposes a topic of a similar name, it leaves
+        out the sources in ``taken``, which other streams use.
         """
         if isinstance(source, TfSource):
             if not self._tf_topics():
@@ -212,13 +211,8 @@ class PoseBag:
         topics = self._parts_of(topic)
         for name in topics:
             if name not in self.topics:
-                hint = (
-                    did_you_mean(
-                        name,
-                        [topic for topic in self.topics if topic not in taken],
-                    )
-                    or "."
-                )
+                free = [topic for topic in self.topics if topic not in taken]
+                hint = did_you_mean(name, free) or "."
                 raise InputError(
                     f"no topic {name} in {self}{hint} {self._listing()}"
                 )
@@ -587,7 +581,7 @@ class PoseBag:
 
 
 def _bag_times(bag_ns: Sequence[int]) -> IntArray:
-    """Return bag times (N,), ns, as int64. Times out of range, from damaged bags, are clipped."""
+    """Return bag times (N,), ns, as int64. Times of damaged bags are clipped to its range."""
     try:
         return np.array(bag_ns, dtype=np.int64)
     except OverflowError:

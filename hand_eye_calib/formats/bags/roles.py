@@ -9,14 +9,15 @@ from hand_eye_calib.formats.bags import messages
 from hand_eye_calib.formats.exports import role_of
 
 # Words in topic names, from the likeliest parent to the likeliest child. The empty word represents
-# topics with none of the other words.
+# topics without any of the other words.
 _WORDS = ("parent", "joint", "base", "lidar", "", "child")
 
 # Common words in frame names. They do not indicate that two frames are of the same sensor.
 _COMMON_WORDS = {"link", "frame", "sensor", "optical", "base"}
 
-# The next four scores of a topic, for a frame that the user sets, are added up. Only their order
-# matters. Score if the messages have the same frame.
+# The user may set the frame of a stream. The next four scores express how well a topic fits this
+# frame, and are added up. Only their order matters.
+# Score if the messages have the same frame.
 _SAME_NAME = 8.0
 # Score for each word that the frame shares with the topic, or with the frame in its messages.
 _SAME_WORD = 2.0
@@ -93,6 +94,7 @@ def _match(frame: str, topic: str, sensor: str) -> float:
 def _parent_first(topic: str) -> tuple[int, str]:
     """Return a sort key with the likeliest parent first. Equal topics are sorted by name."""
     words = {*re.split(r"[/_:]+", topic.lower()), ""}
+    # The word "child" decides, even if another word is present, as in "lidar_child".
     if "child" in words:
         return _WORDS.index("child"), topic
     return min(rank for rank, word in enumerate(_WORDS) if word in words), topic

@@ -422,11 +422,9 @@ class FieldReading(Reading):
                 f"{fields_in_words(message)}"
             ) from None
         stamp_ns = messages.ns_of(value)
-        return (
-            str(value)
-            if stamp_ns is None
-            else f"{Decimal(stamp_ns).scaleb(-9):f}"
-        )
+        if stamp_ns is None:
+            return str(value)
+        return f"{Decimal(stamp_ns).scaleb(-9):f}"
 
     def table(self) -> PoseTable:
         table = self._table

@@ -74,8 +74,11 @@ ALWAYS: Span = (-math.inf, math.inf)
 def kind_of(
     topic: str, name: str, encoding: str, language: str, content: bytes
 ) -> MessageKind:
-    """Return the kind of a connection's messages. Equal connections get the same object."""
-    # ROS 1 has type names package/Type, and ROS 2 package/msg/Type.
+    """Return the kind of a connection's messages. Equal connections get the same object.
+
+    ``name`` is the name of the message type. ``content`` defines the type in ``language``.
+    """
+    # A type name is package/Type in ROS 1, and package/msg/Type in ROS 2.
     if encoding == "ros1" and name.count("/") == 1:
         name = name.replace("/", "/msg/")
     return MessageKind(
@@ -188,10 +191,11 @@ class Storage(ABC):
             raise
         except Exception as error:
             # rosbags reads SQLite with apsw, whose NoMemError is not a subclass of MemoryError.
-            if (
+            is_memory_error = (
                 isinstance(error, MemoryError)
                 or type(error).__name__ == "NoMemError"
-            ):
+            )
+            if is_memory_error:
                 why = "reading it needs too much memory; the file is damaged or malicious"
             else:
                 why = (
@@ -220,7 +224,8 @@ class RosbagsFile(Storage):
             reader.storage.path = Path(quote(str(self._file)))
         if suffix == ".mcap":
             self._repair = (
-                "the library for damaged mcap files, 'pip install mcap'"
+                "'mcap recover', or install the library that reads damaged "
+                "mcap files ('pip install mcap')"
             )
         reader.open()
         opened.callback(reader.close)
@@ -296,21 +301,25 @@ class RosbagsFile(Storage):
 def _rosbag1_message(chunk: bytes, start: int) -> bytes:
     """Return the message at byte ``start`` of a chunk.
 
-    If a record of the connection precedes the message, it is skipped.
+    A record consists of a header and data. If a record that describes the connection precedes the
+    message, this record is skipped.
     """
     end = start
     is_message = False
     while not is_message:
-        header_end = end + _LENGTH.size + _LENGTH.unpack_from(chunk, end)[0]
-        is_message = _MESSAGE_OP in chunk[end:header_end]
-        end = (
-            header_end
-            + _LENGTH.size
-            + _LENGTH.unpack_from(chunk, header_end)[0]
-        )
+        header_start = end
+        header_end = _end_of_part(chunk, header_start)
+        is_message = _MESSAGE_OP in chunk[header_start:header_end]
+        end = _end_of_part(chunk, header_end)
     if end > len(chunk):
         raise EOFError("a chunk ends in the middle of a record")
     return chunk[header_end + _LENGTH.size : end]
+
+
+def _end_of_part(chunk: bytes, start: int) -> int:
+    """Return the end of the header or data at byte ``start``, which begins with its length."""
+    (length,) = _LENGTH.unpack_from(chunk, start)
+    return start + _LENGTH.size + int(length)
 
 
 def reason_of(error: BaseException) -> str:

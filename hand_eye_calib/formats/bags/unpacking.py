@@ -171,8 +171,8 @@ class MessageReader:
         -------
         PoseTable
         (N,) bool array
-            Whether each message contains the quantity. The poses of other messages are NaN, or as
-            in the message.
+            Whether each message contains the quantity. Poses of messages without the quantity are
+            NaN, except for null poses, which are returned as they are.
 
         Raises
         ------
@@ -217,11 +217,12 @@ class MessageReader:
             return values
         out_of_range = values[(np.abs(values[:, :2]) > (90, 360)).any(axis=1)]
         if len(out_of_range):
+            found = "latitude {:.7g} and longitude {:.7g}".format(
+                *out_of_range[0]
+            )
             raise InputError(
-                "found latitude {:.7g} and longitude {:.7g}; the limits are "
-                "90 deg and 360 deg. If both are swapped, repair their source".format(
-                    *out_of_range[0]
-                )
+                f"found {found}; the limits are 90 deg and 360 deg. If latitude and longitude "
+                "are swapped, repair their source"
             )
         lat, lon = np.radians(values[:, :2]).T
         return self._origin.local(lat, lon, values[:, 2])

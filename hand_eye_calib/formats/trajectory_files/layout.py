@@ -122,7 +122,8 @@ def lines_of(
         end = match.end()
         if end - match.start() > LONGEST_LINE:
             raise InputError(
-                f"{path}, line {line_number}: longer than {LONGEST_LINE} characters"
+                f"{path}, line {line_number}: longer than {LONGEST_LINE} characters; pass a file "
+                "with one pose in each line"
             )
         line = match[0]
         if after is None or (
@@ -468,14 +469,11 @@ def _with_units(
 def _with_stamp(names: tuple[str, ...], row: Sequence[str]) -> tuple[str, ...]:
     """Rename a first column with an unknown name to "t" if it has stamps since 1970."""
     columns = named_columns(names)[0].keys()
-    has_stamp = not columns.isdisjoint(
-        {"t", "secs", *named_columns(names[:1])[0]}
-    )
-    return (
-        names
-        if has_stamp or not _SINCE_1970.fullmatch(row[0])
-        else ("t", *names[1:])
-    )
+    first_quantities = named_columns(names[:1])[0].keys()
+    has_stamp = not columns.isdisjoint({"t", "secs", *first_quantities})
+    if has_stamp or not _SINCE_1970.fullmatch(row[0]):
+        return names
+    return ("t", *names[1:])
 
 
 def _with_named_columns(

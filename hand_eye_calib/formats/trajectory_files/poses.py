@@ -155,11 +155,9 @@ def _of_matrices(table: Table) -> tuple[FloatArray, FloatArray]:
     positions = matrices[:, :, 3]
     _refuse_far(table, positions)
     nearest = se3.nearest_rotation(matrices[:, :, :3])
+    errors = np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2))
     table.refuse(
-        np.asarray(
-            np.abs(nearest - matrices[:, :, :3]).max(axis=(1, 2))
-            > ROTATION_TOLERANCE
-        ),
+        np.asarray(errors > ROTATION_TOLERANCE),
         lambda _: (
             f"the 3x3 part is not a rotation matrix within {ROTATION_TOLERANCE}; check the order "
             "of the values"
@@ -477,7 +475,7 @@ def _of_angles(
         if convention:
             reason = ", as in the other file with the same columns"
         elif used != expected:
-            reason = ", because the motion fits that and not the usual"
+            reason = ", because the motion fits this convention and not the usual one"
         axes = "x forward, y left, z up"
         undo = ""
         if used == _INVERSE:

@@ -171,7 +171,8 @@ def refuse_milliseconds(
         for span_s, stamps in zip(spans_s, stamps_ns, strict=True)
     ]
     slow = int(np.argmax(intervals_s))
-    interval_s, span_s = intervals_s[slow], spans_s[slow]
+    interval_s = intervals_s[slow]
+    span_s = spans_s[slow]
     if units[slow] or tables[slow].stamp_unit:
         return
     few_s = CalibratorConfig.min_pairs * interval_s
@@ -214,7 +215,8 @@ def refuse_coarse(
 ) -> None:
     """Raise an InputError if the stamps (N,) of a table have lost their last digits.
 
-    They have, if many poses have the stamp of the previous pose, but other ``values`` (N, k).
+    The digits are lost if many poses have the stamp of the previous pose, but other ``values``
+    (N, k).
     """
     if len(stamps_ns) < 2:
         return
@@ -250,11 +252,8 @@ def _step_of_32_bits(different: IntArray) -> float:
     are_adjacent = (
         len(different) == 1 or np.diff(different).min() < 2.0 * step_s * _NS
     )
-    return (
-        step_s
-        if step_s >= _SHORT_STEP_S and is_multiple and are_adjacent
-        else 0.0
-    )
+    is_possible = step_s >= _SHORT_STEP_S and is_multiple and are_adjacent
+    return step_s if is_possible else 0.0
 
 
 def in_order(

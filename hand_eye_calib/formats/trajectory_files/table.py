@@ -212,11 +212,10 @@ class Table:
         """Return the values (N, k) of k quantities; without names, of all quantities."""
         quantities = [*self.at]
         all_values = np.asarray(self.numbers).reshape(-1, len(quantities))
-        return (
-            all_values[:, [quantities.index(name) for name in names]]
-            if names
-            else all_values
-        )
+        if not names:
+            return all_values
+        places = [quantities.index(name) for name in names]
+        return all_values[:, places]
 
     def fill(
         self,
@@ -405,12 +404,11 @@ class Table:
         try:
             return [float(cells[column]) for column in self._value_at]
         except ValueError:
-            return [
-                angle(cells[column])
-                if name in ("lat", "lon")
-                else number(cells[column])
-                for name, column in self.at.items()
-            ]
+            values = []
+            for name, column in self.at.items():
+                read = angle if name in ("lat", "lon") else number
+                values.append(read(cells[column]))
+            return values
 
     def _is_pose(self, values: Sequence[float]) -> bool:
         """Return whether the values of a row are finite, and its orientation is not all 0."""

@@ -206,7 +206,8 @@ def _advice_on_columns(row: Sequence[str]) -> str:
     """Return the message about rows whose columns are unnamed and fit no known order."""
     if len(row) > len(TUM) and are_whole(row):
         return f"rows of {len(row)} cells without a decimal point; {DECIMAL_COMMAS}"
-    naming = f"name the {len(row)} with `columns`, such as {_EXAMPLES.get(len(row), _EXAMPLE)}"
+    example = _EXAMPLES.get(len(row), _EXAMPLE)
+    naming = f"name the {len(row)} columns with `columns`, such as {example}"
     if len(row) == len(TUM) - 1:
         return (
             "7 numbers in a line, tum has 8 (t x y z qx qy qz qw): is one missing? Otherwise "
