@@ -159,8 +159,8 @@ def test_a_finding_explains_why_the_solver_did_not_converge():
         ),
         (
             "floor",
-            "x is good to 3 cm; the target is 2 cm. Most of it is an allowance for constant "
-            "odometry errors",
+            "x is good to 3 cm; the target is 2 cm. Most of the standard deviation is an allowance "
+            "for constant odometry errors",
         ),
     ],
 )
@@ -344,17 +344,19 @@ if __name__ == "__main__":
         (
             0.004,
             0.0199,
-            "x is good to 2.03 cm; the target is 2 cm. Most of it is an allowance",
+            "x is good to 2.03 cm; the target is 2 cm. Most of the standard deviation is an "
+            "allowance",
         ),
         (
             0.0199,
             0.004,
-            "x is good to 2.03 cm; the target is 2 cm. Part of it is an allowance",
+            "x is good to 2.03 cm; the target is 2 cm. Part of the standard deviation is an "
+            "allowance",
         ),
         (
             0.0004,
             0.0200001,
-            "x is good to 2.0004 cm; the target is 2 cm. Most of it",
+            "x is good to 2.0004 cm; the target is 2 cm. Most of",
         ),
     ],
 )
@@ -386,7 +388,7 @@ def test_several_axes_and_targets_are_named_together():
     ).reasons
     assert reason.sentence == (
         "x is good to 3 cm, y to 4 cm and the rotation about z to 0.4 deg; the targets are 2 cm "
-        "and 0.3 deg. Most of it is an allowance for constant odometry errors"
+        "and 0.3 deg. Most of each deviation is an allowance for constant odometry errors"
     )
 
 

@@ -517,7 +517,7 @@ def test_a_document_whose_sigma_is_not_that_of_its_parts_is_refused():
     changed = document | {"observability": [first | {"sigma": 0.5}, *others]}
     with pytest.raises(
         InputError,
-        match="sigma is not that of sigma_measured and the allowance",
+        match="sigma is not the root sum of squares",
     ):
         Calibration.from_dict(changed)
 

@@ -111,7 +111,7 @@ class Blocks:
         return solve(self.total, columns)
 
     def jackknife(self, columns: Sequence[int]) -> FloatArray:
-        """Return the jackknife covariance (k, k) of :meth:`solve`, leaving out one block each."""
+        """Return the jackknife covariance (k, k) of :meth:`solve`; estimates omit one block."""
         return jackknife_covariance(solve(self.without(), columns))
 
 
@@ -159,10 +159,13 @@ def shift_evidence(
         Covariance of these estimates.
     """
     H = information(tables)
+    # Score of the difference from the estimates, as if the estimates were exact.
     scores = score(tables)[..., None] - H @ before[..., None]
-    relative = np.concatenate([H, scores], axis=-1)
-    spread = np.eye(H.shape[-1]) + H @ covariance
-    return inverse(spread) @ relative
+    if_exact = np.concatenate([H, scores], axis=-1)
+    # The uncertainty C of the estimates reduces the information to inverse(inverse(H) + C), which
+    # is inverse(I + H C) H. The score gets the same factor.
+    growth = np.eye(H.shape[-1]) + H @ covariance
+    return inverse(growth) @ if_exact
 
 
 def solve(
@@ -187,14 +190,15 @@ def solve(
     normal = tables[..., columns, :][..., columns]
     diagonal = np.diagonal(normal, axis1=-2, axis2=-1)
     roots = np.sqrt(np.abs(diagonal))
-    units = np.divide(
+    # Factors that scale the diagonal to 1.
+    factors = np.divide(
         1.0, roots, out=np.zeros_like(roots), where=roots > _MIN_ROOT
     )
-    balanced = normal * units[..., :, None] * units[..., None, :]
+    balanced = normal * factors[..., :, None] * factors[..., None, :]
     damped = balanced + _DAMPING * np.eye(len(columns))
-    scores = units * tables[..., columns, target]
-    answers = np.linalg.solve(damped, scores[..., None])[..., 0]
-    return units * answers
+    scores = factors * tables[..., columns, target]
+    scaled = np.linalg.solve(damped, scores[..., None])[..., 0]
+    return factors * scaled
 
 
 def jackknife_covariance(answers: FloatArray) -> FloatArray:

@@ -102,7 +102,7 @@ def require_backend(method: str, backend: str) -> None:
             if backend in record.backends
         ]
         raise ConfigError(
-            f"method {method} has no backend {backend}; methods with it: {' and '.join(able)}"
+            f"method {method} has no backend {backend}; set method {' or '.join(able)}"
         )
 
 
@@ -138,7 +138,8 @@ _MEASURES = _both(
 )
 _INVERT = _both(
     "none",
-    "Invert the {}'s poses or only its orientations, if they are those of the world in the sensor.",
+    "Invert the {}'s poses, or only its orientations, if they are those "
+    "of the world in the sensor's frame.",
     choices=("none", "poses", "orientations"),
 )
 _QUATERNION = _both(
@@ -153,7 +154,7 @@ _KIND = _both(
     "Constant errors of the {} sensor's poses, which no recording reveals. "
     "odometry (lidar, camera, wheels): every standard deviation contains an "
     "allowance for them. exact (motion capture, surveyed, an INS with RTK, "
-    "simulated without drift): none.",
+    "simulated without drift): no allowance.",
     choices=("odometry", "exact"),
 )
 
@@ -233,7 +234,7 @@ class CalibratorConfig(OptionSet):
     )
     min_inlier_fraction: float = option(
         0.5,
-        "DNLO: at least this share of the pairs counts as inliers (d of eq. 5 over the pairs).",
+        "DNLO: at least this share of the pairs counts as inliers (d of eq. 5, as a share).",
         within=(0.0, 1.0),
     )
     min_pairs: int = option(
@@ -249,16 +250,14 @@ class CalibratorConfig(OptionSet):
     keyframe_min_translation: float = option(
         0.0,
         "Keep a pose pair if the parent sensor has moved this far since the "
-        "last kept pair, or rotated by keyframe.min_rotation. 0 switches "
-        "this off.",
+        "last kept pair, or rotated by keyframe.min_rotation. 0: off.",
         unit="m",
         within=(0.0, 100.0),
     )
     keyframe_min_rotation: float = option(
         0.0,
         "Keep a pose pair if the parent sensor has rotated by this angle "
-        "since the last kept pair, or moved keyframe.min_translation. 0 "
-        "switches this off.",
+        "since the last kept pair, or moved keyframe.min_translation. 0: off.",
         unit="rad",
         within=(0.0, math.pi),
     )
@@ -277,7 +276,7 @@ class CalibratorConfig(OptionSet):
     time_offset: float | str = option(
         0.0,
         "Added to the child's stamps to get the parent's clock. estimate: "
-        "from the angular rates of both streams, of any size.",
+        "from the angular rates of both streams, for offsets of any size.",
         unit="s",
         words=("estimate",),
         within=(-_MAX_OFFSET_S, _MAX_OFFSET_S),
@@ -304,8 +303,8 @@ class CalibratorConfig(OptionSet):
     child_kind: str = _KIND["child"]
     nominal_radius: float = option(
         0.0,
-        "Radius of the wheels by their drawing, for wheel data: another estimate is reported. 0: "
-        "unknown.",
+        "Radius of the wheels by their drawing, for wheel data: an estimate that differs is "
+        "reported. 0: unknown.",
         unit="m",
         within=(0.0, 10.0),
     )
@@ -387,6 +386,7 @@ class CalibratorConfig(OptionSet):
         if not partial:
             return "poses"
         kinds = {measure.kind for measure in partial}
+        # Reasons why a quantity needs poses beside it. Two streams without poses are then refused.
         reasons = [
             measure.needs_poses for measure in partial if measure.needs_poses
         ]
@@ -477,8 +477,7 @@ class NodeConfig(OptionSet):
     child_tf: str = _TF_SOURCE["child"]
     output_directory: str = option(
         "",
-        "Directory of the journal and of the result files of ~/save and of "
-        "the end of the node. Empty for none.",
+        "Directory of the journal and of all saved results. Empty for none.",
     )
     journal: str = option(
         "new",
@@ -515,7 +514,7 @@ class NodeConfig(OptionSet):
     base_frame: str = option(
         "",
         "Also state the child sensor's pose in this frame, from /tf_static. "
-        "Saved files and publish_tf then describe this edge. Empty for none.",
+        "Saved files and publish_tf then use this frame. Empty for none.",
         read_only=True,
     )
     lifecycle: bool = option(

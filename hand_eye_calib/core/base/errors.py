@@ -96,7 +96,7 @@ def located(where: object) -> Iterator[None]:
 
 
 def installing(extra: str) -> str:
-    """Return the command that installs an extra, from source because there is no package index."""
+    """Return the command that installs an extra from source, as no index has this package."""
     return f"pip install '.[{extra}]' in the source folder of hand_eye_calib"
 
 

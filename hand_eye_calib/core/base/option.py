@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Self, TypeAlias
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -19,8 +19,9 @@ OptionField: TypeAlias = dataclasses.Field[Any]
 #: Upper bound of integers (exclusive). They must fit into signed integers of 64 bits.
 LARGEST_INT = 1 << 63
 
-# Number with a unit, such as 35ms or -0.1 s.
+# Number with a decimal comma, such as 0,035.
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+")
+# Number with a unit, such as 35ms or -0.1 s.
 _NUMBER_WITH_UNIT = re.compile(
     r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\w+)"
 )
@@ -70,6 +71,7 @@ def option(
     parse
         For a text option: ``parse(name, value)`` raises ConfigError if the value is not valid.
     """
+    # At this point, the local variables are exactly the arguments.
     metadata = dict(locals())
     return dataclasses.field(default=metadata.pop("default"), metadata=metadata)
 
@@ -96,10 +98,13 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
             spelling, candidates, n=3, cutoff=0.62
         )
         if similar:
-            word = spelling
-            break
-    else:
-        return ""
+            nearest = _nearest(spelling, similar)
+            return f"; did you mean {' or '.join(nearest[:2])}?"
+    return ""
+
+
+def _nearest(word: str, similar: Sequence[str]) -> list[str]:
+    """Return the words among ``similar`` that need the smallest number of edits."""
     n_edits = {
         candidate: _count_edits(word, candidate) for candidate in similar
     }
@@ -109,7 +114,7 @@ def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     ]
     # A candidate with the same letters is first: letters are swapped more often than added.
     nearest.sort(key=lambda candidate: sorted(candidate) != sorted(word))
-    return f"; did you mean {' or '.join(nearest[:2])}?"
+    return nearest
 
 
 def _count_edits(word: str, other: str) -> int:

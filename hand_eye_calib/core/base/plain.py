@@ -15,6 +15,18 @@ from numpy.typing import NDArray
 # Mapping of JSON or YAML: names to plain values.
 Document: TypeAlias = dict[str, Any]
 
+# Names of types in messages.
+_NAMES = {
+    str: "a text",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    list: "a list",
+    dict: "a mapping",
+    Sequence: "a list",
+    Mapping: "a mapping",
+}
+
 # Upper bound of numbers in files. Products of several such numbers are finite.
 _MAX_NUMBER = 1e50
 
@@ -83,7 +95,9 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     if issubclass(kind, Enum):
         return _member(kind, value)
     if isinstance(value, bool) and kind is not bool:
-        raise TypeError(f"a {kind.__name__} is true or false")
+        raise TypeError(
+            f"expected {_NAMES.get(kind, kind.__name__)}, found true or false"
+        )
     return _of_type(kind, value)
 
 
@@ -106,7 +120,7 @@ def _collection(kind: Any, value: Any) -> Any:
         return {key: from_plain(args[1], item) for key, item in items}
     if origin is tuple:
         if isinstance(value, str):
-            raise TypeError("found a text in place of a list")
+            raise TypeError("expected a list, found a text")
         return tuple(
             from_plain(args[0], item) for item in _of_type(Sequence, value)
         )
@@ -148,7 +162,7 @@ def _number(value: Any) -> float:
     if value is None:
         return math.inf
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"a number is {type(value).__name__}")
+        raise TypeError(f"expected a number, found {_name_of(value)}")
     if not abs(value) < _MAX_NUMBER:
         raise ValueError("a number is not finite, or far too large")
     return float(value)
@@ -156,8 +170,15 @@ def _number(value: Any) -> float:
 
 def _of_type(kind: type, value: Any) -> Any:
     if not isinstance(value, kind):
-        raise TypeError(f"a {kind.__name__.lower()} is {type(value).__name__}")
+        expected = _NAMES.get(kind, kind.__name__)
+        raise TypeError(f"expected {expected}, found {_name_of(value)}")
     return value
+
+
+def _name_of(value: Any) -> str:
+    """Return the type of a value for a message."""
+    kind = type(value)
+    return _NAMES.get(kind, kind.__name__)
 
 
 def json_text(document: Any) -> str:

@@ -79,7 +79,7 @@ class BesideMotion(NamedTuple):
     Attributes
     ----------
     add_arguments : callable
-        ``add_arguments(parser)`` declares the argument of the source, which has its name.
+        ``add_arguments(parser)`` declares the argument whose name is the name of the source.
     find : callable
         ``find(paths, snapshot)`` returns measurements for ``Snapshot.beside_motion``, and notes for
         the user.

@@ -109,16 +109,19 @@ def with_options(
     Options that are already in the advice are not repeated.
     """
     text = spelled(advice, interface)
-    ready, measured = {}, {}
+    ready = {}
+    # Priors that the user must measure.
+    to_measure = {}
     for name, value in options.items():
         if value == PLACEHOLDER:
-            measured[name] = value
+            to_measure[name] = value
         elif spelled_options([(name, value)], interface) not in text:
             ready[name] = value
     if ready:
         text = f"{text}: {spelled_options(ready.items(), interface)}"
-    if measured:
-        text = f"{text}, such as {spelled_options(measured.items(), interface)}"
+    if to_measure:
+        examples = spelled_options(to_measure.items(), interface)
+        text = f"{text}, such as {examples}"
     return text
 
 
@@ -145,7 +148,9 @@ def _is_value(name: str, text: str) -> bool:
     with suppress(ValueError):
         value = float(text)
     try:
-        check_value(field, int(value) if type(field.default) is int else value)
+        if type(field.default) is int:
+            value = int(value)
+        check_value(field, value)
     except (ConfigError, ValueError):
         return False
     return True
@@ -162,13 +167,10 @@ def _typed(name: str, value: object) -> str:
 def _name_alone(name: str, interface: Interface) -> str:
     """Return an option without value, such as ``--max-gap``, ``--prior z`` or ``prior["z"]``."""
     group, _, axis = name.partition(".")
+    is_prior = group == "prior"
     if interface is Interface.TERMINAL:
-        return (
-            f"--prior {axis}"
-            if group == "prior"
-            else f"--{name}".translate(_DASHES)
-        )
-    return f'prior["{axis}"]' if group == "prior" else name.replace(".", "_")
+        return f"--prior {axis}" if is_prior else f"--{name}".translate(_DASHES)
+    return f'prior["{axis}"]' if is_prior else name.replace(".", "_")
 
 
 _DASHES = str.maketrans("._", "--")

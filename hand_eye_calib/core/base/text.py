@@ -58,11 +58,8 @@ def amount(axis: str, value: float) -> str:
 def amount_beside(axis: str, value: float, other: float) -> str:
     """Format an amount like :func:`amount`, with the digits needed to differ from ``other``."""
     text = amount(axis, value)
-    if (
-        text != amount(axis, other)
-        or value == other
-        or not math.isfinite(value)
-    ):
+    is_distinct = text != amount(axis, other)
+    if is_distinct or value == other or not math.isfinite(value):
         return text
     *_, unit = text.split(" ")
     factors = {name: factor for _, name, factor in _LENGTHS} | {

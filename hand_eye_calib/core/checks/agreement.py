@@ -103,8 +103,6 @@ _ERROR_DELAY_S = 2.0 * _MIN_DELAY_S
 # The standard deviation of a delay is multiplied by this factor if the delay equals the clock
 # offset: such a delay is expected, and needs less evidence.
 _EXPECTED_SIGMA_SHARE = 2.0 / 3.0
-# A delay equals the clock offset if their ratio differs from 1 by less than this.
-_EXPECTED_DEVIATION = 1.0 - _EXPECTED_SIGMA_SHARE
 # A delay is always an error if it exceeds this time (s), this number of standard deviations, and
 # either the error limit of the shift, or the shift (m) and the explained share below. The largest
 # delays in 81 clean recordings are 33 ms, 38 mm and a share of 0.06 (EuRoC).
@@ -449,7 +447,8 @@ class _Delay:
         sigma_m = self.sigma_s * self.speed_m_s
         # Without an offset, the divisor is 1 s, far above any delay.
         ratio = self.size_s / abs(offset_s or 1.0)
-        is_expected = abs(ratio - 1.0) < _EXPECTED_DEVIATION
+        # A ratio within a third of 1 counts as equality.
+        is_expected = abs(ratio - 1.0) < 1.0 - _EXPECTED_SIGMA_SHARE
         if is_expected:
             sigma_m *= _EXPECTED_SIGMA_SHARE
         error_m = LIMITS["late"].error

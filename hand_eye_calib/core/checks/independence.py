@@ -98,13 +98,11 @@ _STEADY = 1.25
 # Shortest path (m) on which _STEADY is applied. Hand-held sensors in a motion capture room do not
 # drift either; their paths are shorter (100 m).
 _STEADY_PATH_M = 190.0
-# The next two limits are for the noise of the difference of both streams, divided by the noise of
-# the noisier stream. The noise of a copy contains the noise of its source, whereas the noise of two
-# sensors adds up. Largest ratio for a copy.
-_MAX_NOISE_OF_COPY = 1.1
-# Smallest ratio for a copy. Below this limit the noisier stream consists of motion, or the copy has
-# so little noise of its own that _SHARED detects the copy.
-_MIN_NOISE_OF_COPY = 0.33
+# Smallest and largest noise of the difference between a copy and its source, divided by the noise
+# of the noisier stream. The noise of a copy contains the noise of its source, whereas the noise of
+# two sensors adds up. Below the smallest value, the noisier stream consists of motion, or the copy
+# has so little noise of its own that _SHARED detects the copy.
+_NOISE_OF_COPY = (0.33, 1.1)
 # The noise of one stream is regressed on the noise of the other. The factor is about 1 for a copy
 # and its source, and 0 for two sensors. A stream is a copy if the factor exceeds this limit ...
 _CONTAINED = 0.5
@@ -243,7 +241,13 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     of_source = of_source @ se3.nearest_rotation(
         of_source[:, 1].T @ of_computed[:, 1]
     )
-    difference = _without_lever_arm(of_source - of_computed, of_computed[:, 1])
+    difference = of_source - of_computed
+    # Subtract the best lever arm from the translations of the difference.
+    arms = se3.skew(of_computed[:, 1])
+    lever_arm, *_ = np.linalg.lstsq(
+        arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
+    )
+    difference[:, 0] -= arms @ lever_arm
     is_calm = _is_calm(of_computed, of_source)
     # Axes of the spectra: quarter, stream, quantity (0 positions, 1 orientations).
     quarters = _upper_quarters(
@@ -263,21 +267,6 @@ def _shared_noise(computed: Trajectory, source: Trajectory) -> float:
     # The difference falls as steeply as motion does, and more steeply than errors that add up.
     is_steep = noise_of_difference[0, 1] > _FLAT**2 * noise_of_difference[1, 1]
     return max(of_orientations, 0.0) if is_steep else 0.0
-
-
-def _without_lever_arm(
-    difference: FloatArray, rotations: FloatArray
-) -> FloatArray:
-    """Subtract the best lever arm from the translations of a difference (N, 2, 3).
-
-    ``rotations`` (N, 3) are the second differences of the rotations of one stream.
-    """
-    arms = se3.skew(rotations)
-    lever_arm, *_ = np.linalg.lstsq(
-        arms.reshape(-1, 3), difference[:, 0].ravel(), rcond=None
-    )
-    difference[:, 0] -= arms @ lever_arm
-    return difference
 
 
 def _second_differences(Ts: FloatArray) -> FloatArray:
@@ -483,8 +472,9 @@ def _is_noise_shared(pose_pairs: PosePairs, X: FloatArray) -> bool:
     of_noisier = quarters[:, :2].max(axis=1)
     shares = (quarters[:, 2].sum(axis=0) / of_noisier.sum(axis=0)) ** 0.5
     is_white = of_noisier.max(axis=0) < _FLAT * of_noisier.min(axis=0)
-    is_noise = is_white & (shares > _MIN_NOISE_OF_COPY)
-    if not is_noise.any() or (shares[is_noise] > _MAX_NOISE_OF_COPY).any():
+    smallest, largest = _NOISE_OF_COPY
+    is_noise = is_white & (shares > smallest)
+    if not is_noise.any() or (shares[is_noise] > largest).any():
         return False
     of_parent, of_child = quarters[:, :2].sum(axis=0)
     # The quieter stream is first: it may be the source of the noisier one.

@@ -17,9 +17,9 @@ from hand_eye_calib.core.geometry.se3 import (
 # above it.
 _MAX_SIGMA_RAD = 0.3
 
-# In gimbal lock, roll and yaw are unknown: the cosine of the pitch is below this number of standard
-# deviations (rad) of the rotation. The standard deviations of roll and yaw would exceed 10 deg, and
-# their errors would not be normal.
+# Roll and yaw are unknown (gimbal lock) if the cosine of the pitch is below this number times the
+# standard deviation (rad) of the rotation. The standard deviations of roll and yaw would exceed
+# 10 deg, and their errors would not be normal.
 _LOCKED_SIGMAS = 5.0
 
 # Smallest cosine of the pitch at which exact rotations have known roll and yaw.
@@ -87,6 +87,7 @@ def sigmas_rpy(
         np.maximum(np.diag(jacobian @ covariance @ jacobian.T), 0.0)
     )
     sigmas[sigmas > _MAX_SIGMA_RAD] = np.inf
+    # Standard deviations about the principal axes. Unknown axes do not count.
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
     largest = np.max(principal[principal <= _MAX_SIGMA_RAD], initial=0.0)
     cosine_of_pitch = np.hypot(rotation[0, 0], rotation[1, 0])

@@ -441,9 +441,10 @@ class FrameTree:
         if edge.parent != parent:
             raise InputError(
                 f"frame {frame!r} has two parents, {edge.parent!r} and {parent!r}: "
-                f"{self._origin} do not form a tree; record only one of their publishers"
+                f"{self._origin} do not form a tree; record the transforms of one publisher only"
             )
-        edge.is_static &= is_static
+        if not is_static:
+            edge.is_static = False
         edge.pose = pose
         return edge
 
@@ -482,10 +483,10 @@ class FrameTree:
         return T_frame_of
 
     def route(self, frame: str, of: str) -> tuple[list[str], list[str]]:
-        """Return the edges on the path from ``frame`` to ``of``, by the frames below them.
+        """Return the edges on the path from ``frame`` to ``of``.
 
-        The first list has the edges up to the common frame, and the second list the edges down from
-        it.
+        An edge is represented by its lower frame. The first list has the edges from ``frame`` up to
+        the common frame. The second list has the edges from the common frame down to ``of``.
 
         Raises
         ------
@@ -521,7 +522,8 @@ class FrameTree:
             frame = self.edges[frame].parent
             if frame in frames:
                 raise InputError(
-                    f"{self._origin} form a loop through frame {frame!r}"
+                    f"{self._origin} form a loop through frame {frame!r}: "
+                    "correct the parent of a frame in this loop"
                 )
             frames.append(frame)
         return frames

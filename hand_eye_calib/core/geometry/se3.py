@@ -220,21 +220,23 @@ def _scaled_quats(rotations: FloatArray) -> FloatArray:
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotations.reshape(-1, 9).T
     trace = r00 + r11 + r22
     quats = np.stack([r21 - r12, r02 - r20, r10 - r01, 1.0 + trace], axis=1)
-    # A trace that is not negative means that the scalar is large enough. Otherwise, start from the
-    # largest coefficient i of the vector part.
-    large = np.flatnonzero(trace < 0.0)
-    if large.size:
-        R = rotations[large]
-        row = np.arange(len(large))
+    # If the trace is negative, the scalar is too small to start from. Start from the largest
+    # coefficient i of the vector part.
+    negative = np.flatnonzero(trace < 0.0)
+    if negative.size:
+        R = rotations[negative]
+        row = np.arange(len(negative))
         i = np.argmax(np.diagonal(R, axis1=1, axis2=2), axis=1)
         j = (i + 1) % 3
         k = (i + 2) % 3
         by_vector = np.empty((len(R), 4))
-        by_vector[row, i] = 1.0 - trace[large] + 2.0 * R[row, i, i]
+        by_vector[row, i] = 1.0 - trace[negative] + 2.0 * R[row, i, i]
         by_vector[row, j] = R[row, j, i] + R[row, i, j]
         by_vector[row, k] = R[row, k, i] + R[row, i, k]
         by_vector[:, 3] = R[row, k, j] - R[row, j, k]
-        quats[large] = np.where(by_vector[:, 3:] < 0.0, -by_vector, by_vector)
+        quats[negative] = np.where(
+            by_vector[:, 3:] < 0.0, -by_vector, by_vector
+        )
     return quats
 
 
@@ -456,6 +458,7 @@ def put_right(
     (N, 4, 4) array
     """
     if quaternion != "xyzw":
+        # Move the true x, which was read at another place, to the first place.
         quats = np.roll(to_quat_xyzw(Ts), -quaternion.index("x"), axis=-1)
         Ts = from_quat_xyzw(translation_of(Ts), quats)
     if invert == "poses":

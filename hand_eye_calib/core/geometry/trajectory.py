@@ -31,23 +31,23 @@ QUATERNION_NORM_TOLERANCE = 1e-2
 # millimetres, about 6.4e9.
 FARTHEST_M = 1e10
 
-# A position on the ground is farther from the centre of the earth than this (m) ...
+# Smallest distance (m) of a place on the ground from the centre of the earth.
 _MIN_EARTH_M = 6.3e6
-# ... and a position of an aircraft is nearer than this (m).
+# Largest distance (m) of an aircraft from the centre of the earth.
 _MAX_EARTH_M = 6.45e6
 
 # Largest element of R'R - I for a rotation matrix R. A matrix with six digits passes; a scaled
 # matrix fails.
 ROTATION_TOLERANCE = 1e-3
 
-# Directions of motion are those of steps whose length is the extent of all positions divided by
-# this number. At least a fifth of this number of steps is needed.
+# The direction of motion is computed for steps along the path. The length of a step is the extent
+# of all positions, divided by this number. At least a fifth of this number of steps is needed.
 _STEPS_IN_EXTENT = 50
 
-# A convention is wrong if the scatter of its direction of motion exceeds this value, see
-# :func:`scatter_of_direction` ...
+# A convention is wrong if the scatter of its direction of motion exceeds two limits, see
+# :func:`scatter_of_direction`. First limit: this value.
 STEADY_SCATTER = 0.05
-# ... and also this multiple of the scatter in another convention.
+# Second limit: this multiple of the scatter in another convention.
 WRONG_SCATTER_RATIO = 4.0
 
 
@@ -114,8 +114,7 @@ class Columns(WithArrays):
     """Base of dataclasses with arrays of equally many rows; the first field is an array."""
 
     def __len__(self) -> int:
-        # Use the name of the first field. A tuple of all columns is slower, and loops need this
-        # often.
+        # Loops call this often. A tuple of all columns would be slower than the first field.
         first = next(iter(self.__dataclass_fields__))
         return len(getattr(self, first))
 
@@ -171,8 +170,8 @@ class Trajectory(Columns):
     world_frame: str = ""
     measures: str = "poses"
 
-    # Trajectory with the original stamps, if the stamps of this one were shifted. Both have the
-    # same `_steps`.
+    # Trajectory with the original stamps, if the stamps of this trajectory were shifted. Both
+    # trajectories have the same `_steps`.
     _unshifted: ClassVar[Self | None] = None
 
     def __hash__(self) -> int:

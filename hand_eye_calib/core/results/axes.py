@@ -20,7 +20,20 @@ from hand_eye_calib.core.results.result import Result
 class ReachableAxis(NamedTuple):
     """An axis that the streams can determine.
 
-    ``sigma`` is the measured standard deviation (m or rad). ``total`` also contains the allowance.
+    Attributes
+    ----------
+    name : str
+        x, y, z, roll, pitch or yaw.
+    sigma : float
+        Measured standard deviation, m or rad.
+    total : float
+        Standard deviation with the allowance for constant errors.
+    target : float
+        Largest acceptable standard deviation.
+    is_hidden : bool
+        Whether this recording does not determine the axis.
+    is_known_by_hand : bool
+        Whether mostly or only a prior determines the axis.
     """
 
     name: str

@@ -164,6 +164,7 @@ class Calibration(Judged):
                 name: part(name).invert(value)
                 for name, value in self.parts.items()
             },
+            # Subtracting from 0.0 changes an offset of 0.0 to 0.0, and not to -0.0.
             time_offset_s=0.0 - self.time_offset_s,
             scale=1.0 / self.scale,
             scale_sigma=self.scale_sigma / self.scale**2,
@@ -253,7 +254,7 @@ class Calibration(Judged):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Build from the mapping that :meth:`to_dict` returned; other keys are ignored.
+        """Build a result from the mapping that :meth:`to_dict` returned; other keys are ignored.
 
         Raises
         ------

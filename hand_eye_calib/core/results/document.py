@@ -66,10 +66,10 @@ _SHARED = 0.02
 class Notation:
     """A transform in the notations of documents: translation, quaternion, angles and matrix.
 
-    ``maps`` names source and target. Each number (m, deg) has a standard deviation (``sigma``), and
-    a part of it without the allowance (``sigma_measured``). ``sigma_about_deg`` has the standard
-    deviations of the rotation about the axes x, y and z of the target. An unknown number is NaN
-    with an infinite standard deviation. An unknown rotation has no quaternion.
+    ``maps`` names source and target. Each number (m, deg) has a standard deviation (``sigma``).
+    ``sigma_measured`` is the part of this deviation without the allowance. ``sigma_about_deg`` has
+    the standard deviations of the rotation about the axes x, y and z of the target. An unknown
+    number is NaN with an infinite standard deviation. An unknown rotation has no quaternion.
     """
 
     maps: str
@@ -103,7 +103,10 @@ def document_of(result: Judged) -> Document:
         "observability": _observability_of(result),
     }
     if result.T_method is not None:
-        of = "T_parent_child as the method solved it: nothing set, no prior added"
+        of = (
+            "T_parent_child as the method solved it, without priors and without values that "
+            "replace unobservable directions"
+        )
         document["T_method"] = {"of": of, "matrix": result.T_method}
     document["findings"] = [finding.to_dict() for finding in result.findings]
     others = {
@@ -282,7 +285,7 @@ def _inliers_in_words(result: Result) -> dict[str, str]:
 def summary(result: Result) -> dict[str, str]:
     """Return quantities of the solve with their values as text."""
     rate = result.clock_rate
-    proof = {"yes": "", "no": "not "}
+    proofs = {"yes": "proved", "no": "not proved"}
     offset = result.time_offset_s
     method = f"{result.method} ({result.backend})"
     if result.method_reason:
@@ -298,10 +301,9 @@ def summary(result: Result) -> dict[str, str]:
         ),
         "Scale": given_or_estimated(result.scale, result.scale_sigma, ""),
     }
-    if result.proved_global in proof:
-        rows["Objective"] += (
-            f", {proof[result.proved_global]}proved to be the global minimum"
-        )
+    if result.proved_global in proofs:
+        proof = proofs[result.proved_global]
+        rows["Objective"] += f", {proof} to be the global minimum"
     if rate and rate.is_used:
         rows["Time offset"] += (
             f" at {rate.at_ns * 1e-9:.3f} s; the child's clock is {rate}"
@@ -375,7 +377,7 @@ def parts_of_sigmas(transform: Notation) -> dict[str, str]:
 
 
 def angles_in_words(transform: Notation, result: Result) -> str:
-    """Explain angles that are less or more certain than the rotation; empty if none is.
+    """Explain why angles are less or more certain than the rotation; empty if they are not.
 
     Near a pitch of 90 deg, a small rotation changes both roll and yaw by much. The three angles are
     applied one after the other about fixed axes, so their standard deviations may differ from those

@@ -22,7 +22,7 @@ class ExtraTransform(NamedTuple):
 
 
 class Part:
-    """Part that is a single record. It has the same name in results and documents.
+    """Part of a result, by default a single record with the same name in results and documents.
 
     Parameters
     ----------

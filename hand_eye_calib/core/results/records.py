@@ -237,7 +237,7 @@ class Finding:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Build from the mapping that :meth:`to_dict` returned.
+        """Build a finding from the mapping that :meth:`to_dict` returned.
 
         If this installation has no templates for the values, the sentences of the mapping are kept.
         The mapping is then from another version, or from an extra that is not installed.
@@ -341,6 +341,17 @@ class Noise:
 
     Standard deviations are per axis, for both sensors together. ``white`` is the noise of a single
     pose; ``drift`` is the random walk from pose to pose.
+
+    Attributes
+    ----------
+    in_words : tuple of str
+        The noise in sentences for the user.
+    misfit : float or None
+        Weighted squared residual over its expected value. It is about 1 if the errors fit the noise
+        model, and larger if they do not.
+    lasting : tuple of CorrelatedError
+    systematic : str
+        Names of the significant systematic errors, joined by "+", or "none".
     """
 
     in_words: tuple[str, ...]

@@ -51,8 +51,8 @@ class Result:
         Whether no transform has a smaller cost over the inliers: "yes" (proved), "no", or "not
         tried" (:mod:`hand_eye_calib.core.solvers.certificate`).
     method, reference, backend : str
-        Method, reference and backend of the solve. If the user set ``auto``, they are the chosen
-        ones.
+        Method, reference and backend of the solve, never ``auto``: if the user set ``auto``, they
+        are the chosen method, reference and backend.
     method_reason, reference_reason : str
         Why ``auto`` chose the method and the reference; empty if the user set them.
     time_offset_s, time_offset_sigma_s : float

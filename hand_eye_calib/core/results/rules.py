@@ -6,7 +6,7 @@ has the same table, and a test compares both.
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -80,7 +80,8 @@ _CONTRADICTION_TEXTS = {
     "halves": (
         "the two halves of the recording disagree",
         "this result claims",
-        "check that both mounts are tight and record again; use only axes on which both agree",
+        "check that both mounts are tight and record again; use only axes on which the halves "
+        "agree",
     ),
     "methods": (
         "robust least squares disagrees",
@@ -138,7 +139,7 @@ def _nothing_known(result: Result) -> Iterator[Ground]:
             else "turn too little for their errors"
         )
         ground = _hidden_ground(result, f"these stops, which {why}")
-        advice = f"turn the hand about at least two axes between them, or {ground.advice}"
+        advice = f"turn the hand about at least two axes between stops, or {ground.advice}"
         yield ground._replace(advice=advice)
 
 
@@ -302,31 +303,31 @@ def _worse_than_target(result: Result) -> Iterator[Ground]:
     sentence = (
         f"standard deviations above the target of {targets}: {listing(sizes)}"
     )
-    allowances = [
-        (axis, math.sqrt(axis.total**2 - axis.sigma**2)) for axis in rough
-    ]
-    # If the allowance alone exceeds the target, the target cannot be reached. If the allowance is
-    # less than half of the rest, a longer recording still helps.
-    hopeless = [
-        (axis.name, size) for axis, size in allowances if size > axis.target
-    ]
+    yield Ground(sentence, _advice_for_target(result, rough), names)
+
+
+def _advice_for_target(result: Result, rough: Sequence[ReachableAxis]) -> str:
+    """Return the advice for axes whose measured standard deviation exceeds the target."""
+    # Axes whose allowance alone exceeds the target. No recording reaches their target.
+    hopeless = []
+    does_recording_help = False
+    for axis in rough:
+        allowance = math.sqrt(axis.total**2 - axis.sigma**2)
+        if allowance > axis.target:
+            hopeless.append((axis.name, allowance))
+        # A longer recording reduces only the measured part, so this part must dominate.
+        if allowance <= axis.target or 2.0 * allowance < axis.sigma:
+            does_recording_help = True
     advice = []
-    if any(
-        size <= axis.target or 2.0 * size < axis.sigma
-        for axis, size in allowances
-    ):
-        are_stops = result.reference == "stops"
-        more = (
-            "more stops, with larger rotations"
-            if are_stops
-            else "longer, with more motion"
-        )
-        advice.append(f"record {more}")
+    if does_recording_help and result.reference == "stops":
+        advice.append("record more stops, with larger rotations")
+    elif does_recording_help:
+        advice.append("record longer, with more motion")
     if hopeless:
         alone = f"{cause_of_allowance(result)} alone leave {amounts_in_words(hopeless)}"
         to_do = _floor_advice(result, [name for name, _ in hopeless])
         advice.append(f"{alone}: {to_do}")
-    yield Ground(sentence, "; ".join(advice), names)
+    return "; ".join(advice)
 
 
 def _floor(result: Result) -> Iterator[Ground]:
@@ -348,14 +349,15 @@ def _floor(result: Result) -> Iterator[Ground]:
     ]
     is_one = len({amount(axis.name, axis.target) for axis in above}) == 1
     target_is = "the target is" if is_one else "the targets are"
-    share = (
-        "Most"
-        if all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above)
-        else "Part"
+    # The allowance is most of a standard deviation if it is more than half of the variance.
+    is_most = all(axis.total**2 > 2.0 * axis.sigma**2 for axis in above)
+    share = "Most" if is_most else "Part"
+    deviations = (
+        "the standard deviation" if len(above) == 1 else "each deviation"
     )
     sentence = (
         f"{listing(sizes)}; {target_is} {targets_in_words(above)}. "
-        f"{share} of it is an allowance for {cause_of_allowance(result)}"
+        f"{share} of {deviations} is an allowance for {cause_of_allowance(result)}"
     )
     yield Ground(sentence, _floor_advice(result, names), names)
 
@@ -391,7 +393,7 @@ _OWN_RULES = (
     Rule(
         "nothing_known",
         _NEVER,
-        "all six axes are unobservable; of stops, any",
+        "all six axes are unobservable; with stops, any axis",
         _nothing_known,
     ),
     Rule(
@@ -415,7 +417,7 @@ _OWN_RULES = (
     Rule(
         "methods",
         _CARE,
-        f"answers of robust least squares {_APART}; or answers about as certain as the result "
+        f"estimates of robust least squares {_APART}; or estimates about as certain as the result "
         f"differ by {CONTRADICTED_SIGMAS:g} of its standard deviations and "
         f"{CONTRADICTED_TARGETS:g} targets",
         partial(_contradiction, "methods"),

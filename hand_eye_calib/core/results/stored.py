@@ -64,11 +64,12 @@ def result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
         return _result_from(of, _measured_parts(data))
     except KeyError as error:
         raise InputError(
-            f"the calibration has no {error}: restore or repeat it"
+            f"the calibration has no {error}: restore the file, or calibrate again"
         ) from None
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"the calibration was changed after it was written: {error}; restore or repeat it"
+            f"the calibration was changed after it was written: {error}; restore the file, or "
+            "calibrate again"
         ) from None
 
 
@@ -84,8 +85,9 @@ def _measured_parts(data: Mapping[str, Any]) -> Document:
         document["observability_measured"] = data["observability"]
         return document
     whole = covariance_of(data["covariance"])
-    parts = [covariance_of(data[name]) for name in _OLD_COVARIANCES]
-    if not np.allclose(whole, parts[0] + parts[1], rtol=1e-6, atol=1e-300):
+    measured = covariance_of(data["covariance_measured"])
+    allowance = covariance_of(data["covariance_allowance"])
+    if not np.allclose(whole, measured + allowance, rtol=1e-6, atol=1e-300):
         raise ValueError(
             "covariance is not the sum of covariance_measured and its allowance"
         )
@@ -129,21 +131,23 @@ def _result_from(of: type[_OfResult], data: Mapping[str, Any]) -> _OfResult:
 
 
 def _require_known_names(result: Result) -> None:
-    """Raise ValueError if a result has an axis or a method that this program does not know."""
+    """Raise ValueError if a result has an axis or a method that this version does not have."""
     if tuple(dof.name for dof in result.observability) != AXES:
         raise ValueError(f"the axes of observability are not {', '.join(AXES)}")
     for name in ("contradictions", "target_axes", "cross_check"):
         if not {*(getattr(result, name) or {})} <= {*AXES}:
             raise ValueError(f"{name} has other axes than {', '.join(AXES)}")
     if result.method not in METHODS:
-        raise ValueError(f"method {result.method} is not known")
+        raise ValueError(f"this version has no method {result.method}")
 
 
 def _findings_of(data: Mapping[str, Any]) -> tuple[Finding, ...]:
     """Return the findings of a document."""
     rows = data.get("findings", [])
     if not isinstance(rows, (list, tuple)):
-        raise TypeError(f"findings: a list is {type(rows).__name__}")
+        raise TypeError(
+            f"findings: expected a list, found {type(rows).__name__}"
+        )
     return tuple(map(Finding.from_dict, rows))
 
 
@@ -152,7 +156,7 @@ def _require_sigmas(result: Result, rows: Sequence[Mapping[str, Any]]) -> None:
     sigmas = [from_plain(float, row["sigma"]) for row in rows]
     if not np.allclose(sigmas, result.sigmas, rtol=1e-6, atol=1e-300):
         raise ValueError(
-            "sigma is not that of sigma_measured and the allowance"
+            "sigma is not the root sum of squares of sigma_measured and the allowance"
         )
 
 

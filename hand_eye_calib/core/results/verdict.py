@@ -69,32 +69,41 @@ class Judged(Result):
         notes = self._notes()
         gravest = shown(self.reasons)
         if not gravest:
-            return "; ".join([what_is_known(self), *notes])
-        first, *others = gravest
-        if first.rule == "unobservable":
-            hidden = listing(first.axes)
-            them = hidden if len(first.axes) == 1 else "them"
-            text = f"all but {hidden}; measure {them} by hand"
-            if self.out_of_reach:
-                # Axes out of reach are not hidden, but they are not known either.
-                axes = axes_within_reach(self)
-                known = listing(
-                    [axis.name for axis in axes if not axis.is_hidden]
-                )
-                text = f"{known} only; measure {them} by hand"
-            if others:
-                text += f"; {others[0].sentence}"
+            text = what_is_known(self)
+        elif gravest[0].rule == "unobservable":
+            text = self._usable_axes(gravest)
         else:
-            text = first.sentence
-            if others:
-                text += f" (and {counted(len(others), 'more reason')})"
-            is_limit = all(reason.kind == "physics" for reason in self.reasons)
-            # A warning may be about a fault that was repaired, or about a possible fault.
-            if is_limit and not self.warnings:
-                text += f"; {_NO_FAULT}"
+            text = self._gravest_reason(gravest)
             if self.verdict is Verdict.DO_NOT_USE:
                 notes = []
         return "; ".join([text, *notes])
+
+    def _usable_axes(self, gravest: Sequence[Reason]) -> str:
+        """Return the axes that may be used, if the gravest reason is that some axes are hidden."""
+        first, *others = gravest
+        hidden = listing(first.axes)
+        them = hidden if len(first.axes) == 1 else "them"
+        text = f"all but {hidden}; measure {them} by hand"
+        if self.out_of_reach:
+            # Axes out of reach are not hidden, but they are not known either.
+            axes = axes_within_reach(self)
+            known = listing([axis.name for axis in axes if not axis.is_hidden])
+            text = f"{known} only; measure {them} by hand"
+        if others:
+            text += f"; {others[0].sentence}"
+        return text
+
+    def _gravest_reason(self, gravest: Sequence[Reason]) -> str:
+        """Return the first reason, the number of others, and whether a fault was found."""
+        first, *others = gravest
+        text = first.sentence
+        if others:
+            text += f" (and {counted(len(others), 'more reason')})"
+        is_limit = all(reason.kind == "physics" for reason in self.reasons)
+        # A warning may be about a fault that was repaired, or about a possible fault.
+        if is_limit and not self.warnings:
+            text += f"; {_NO_FAULT}"
+        return text
 
     @property
     def reasons_in_headline(self) -> tuple[Reason, ...]:

@@ -33,6 +33,7 @@ from hand_eye_calib.core.base.blocks import (
     score,
     shift_evidence,
 )
+from hand_eye_calib.core.base.config import STAMP_UNITS
 from hand_eye_calib.core.base.stats import NINE_TIMES_OUT_OF_TEN, robust_weights
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.covariances import sigmas_in_parent
@@ -112,7 +113,7 @@ _LAGS = (
     .round()
     .astype(int)
 )
-_SECOND_NS = 1_000_000_000
+_SECOND_NS = STAMP_UNITS["s"]
 
 # Prior covariances (3, 6, 6) of shifts: only a translation, only a rotation, or both. The second
 # covariance detects a pure rotation sooner than the third.
