@@ -103,7 +103,7 @@ class ResultState:
     facts : tuple of str
         Short sentences about the evidence, such as the smallest error that would have been noticed.
     angles : str
-        Sentence about angles that are less or more certain than the rotation; empty if none is.
+        Sentence about angles whose certainty differs from that of the rotation; empty without any.
     caution, step : str
         The gravest reason for the verdict and the next step, in a few words; empty for ``USE``.
     age_s : float
@@ -134,8 +134,12 @@ class ExtrinsicState(Part):
 
     Attributes
     ----------
+    is_solving : bool
+        Whether a solve is running.
     slow : str
         Sentence about slow solves with the reason; empty if solves are fast.
+    n_poses : int
+        Number of synchronised pose pairs.
     path_m : float
         Length of the path (m).
     motion_s : float
@@ -147,6 +151,8 @@ class ExtrinsicState(Part):
         Rotation of the parent sensor about x, y and z (deg).
     tf_static, tf_static_reason
         Whether the result is broadcast; if not, the reason.
+    standing : Standing
+        Validity of the result.
     problem : str
         Reason why the result is outdated or refuted; empty otherwise.
     priors : mapping of str to str
@@ -285,6 +291,10 @@ class MountState(Part):
 
     Attributes
     ----------
+    is_learning : bool
+        Whether the monitor still measures the noise of the streams, and cannot detect a shift.
+    seconds_of_motion : int
+        Time for which the sensors have moved (s).
     shift, shift_sigma : mapping of str to float or None
         Shift that the alarm reports, and its standard deviation, by axis (m, rad).
     visible_10min : mapping of str to float or None
