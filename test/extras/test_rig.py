@@ -303,7 +303,7 @@ def test_a_sensor_of_any_name_stays_below_the_directory(calibrated, tmp_path):
     assert saved == ["__x__a", "__x__a_2"]
     assert "../$x$/a" in render_rig(odd, ["a.txt"])
     with pytest.raises(
-        InputError, match=r"of a rig; name one of its sensors: .*__x__a_2"
+        InputError, match=r"of a rig; pass the folder of one sensor: .*__x__a_2"
     ):
         hec.load(tmp_path / "rig")
 
