@@ -331,7 +331,7 @@ def test_an_axis_that_is_not_known_is_refused():
     flat = result("base_link", "lidar", **unknown("z"))
     for name in EXPORT_FORMATS:
         with pytest.raises(
-            InputError, match="does not determine z; .* with a prior"
+            InputError, match="does not determine z; .* with priors"
         ):
             flat.export(name)
     with pytest.raises(

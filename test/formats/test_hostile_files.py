@@ -62,7 +62,10 @@ HOSTILE_YAML = {
     "list as a key": ("? [a, b]\n: 1", "unhashable key"),
     "two documents": ("a: 1\n---\nb: 2", "is not readable YAML"),
     "control characters": ("a: \x01", "is not readable YAML"),
-    "too large": ("# " + "x" * (1 << 20), "larger than 1048576 bytes"),
+    "too large": (
+        "# " + "x" * (1 << 20),
+        "larger than the limit of 1048576 bytes",
+    ),
 }
 
 

@@ -230,7 +230,9 @@ def test_exports_of_messages_have_stamps_in_two_columns_and_quoted_tuples(file):
 
 def test_without_a_header_the_columns_must_be_named(file):
     path = file(rows(TRAJECTORY.stamps_ns, "wxyz", " "))
-    message = "so their order is unknown; name the 8 with `columns`, such as"
+    message = (
+        "so their order is unknown; name the 8 columns with `columns`, such as"
+    )
     with pytest.raises(InputError, match=message):
         hec.read_trajectory(path, "csv")
     assert_is_the_trajectory(hec.read_trajectory(path, "csv", columns=WXYZ))

@@ -107,7 +107,7 @@ def test_only_auto_guesses(tmp_path):
     path = write_unnamed(tmp_path / "poses.mat", driven(), SCALAR_FIRST)
     assert read_trajectory_file(path).guesses == []
     with pytest.raises(
-        InputError, match="so their order is unknown; name the 8 with"
+        InputError, match="so their order is unknown; name the 8 columns with"
     ):
         read_trajectory_file(path, "csv")
 

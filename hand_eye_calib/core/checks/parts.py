@@ -77,12 +77,12 @@ def check_turned_parts(pose_pairs: PosePairs) -> list[Finding]:
         parts = (motions[motions.j < split], motions[motions.i >= split])
         if min(map(len, parts)) < MIN_PAIRS:
             continue
-        # Shares that the rotation of the same part, or of the other part, leaves unexplained.
         second = _rotation_of_part(parts[1])
         if _unexplained(parts[0], second) <= _OTHER_PART:
             # One extrinsic explains both parts, as in most recordings.
             continue
         first = _rotation_of_part(parts[0])
+        # Shares that the rotation of the same part, or of the other part, leaves unexplained.
         by_own = max(
             _unexplained(parts[0], first), _unexplained(parts[1], second)
         )
