@@ -15,18 +15,6 @@ from numpy.typing import NDArray
 # Mapping of JSON or YAML: names to plain values.
 Document: TypeAlias = dict[str, Any]
 
-# Names of types in messages.
-_NAMES = {
-    str: "a text",
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    list: "a list",
-    dict: "a mapping",
-    Sequence: "a list",
-    Mapping: "a mapping",
-}
-
 # Upper bound of numbers in files. Products of several such numbers are finite.
 _MAX_NUMBER = 1e50
 
@@ -95,9 +83,7 @@ def from_plain(kind: Any, value: Any, **names: type) -> Any:
     if issubclass(kind, Enum):
         return _member(kind, value)
     if isinstance(value, bool) and kind is not bool:
-        raise TypeError(
-            f"expected {_NAMES.get(kind, kind.__name__)}, found true or false"
-        )
+        raise TypeError(f"expected {kind.__name__}, found true or false")
     return _of_type(kind, value)
 
 
@@ -162,7 +148,7 @@ def _number(value: Any) -> float:
     if value is None:
         return math.inf
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"expected a number, found {_name_of(value)}")
+        raise TypeError(f"expected a number, found {type(value).__name__}")
     if not abs(value) < _MAX_NUMBER:
         raise ValueError("a number is not finite, or far too large")
     return float(value)
@@ -170,15 +156,10 @@ def _number(value: Any) -> float:
 
 def _of_type(kind: type, value: Any) -> Any:
     if not isinstance(value, kind):
-        expected = _NAMES.get(kind, kind.__name__)
-        raise TypeError(f"expected {expected}, found {_name_of(value)}")
+        raise TypeError(
+            f"expected a {kind.__name__.lower()}, found {type(value).__name__}"
+        )
     return value
-
-
-def _name_of(value: Any) -> str:
-    """Return the type of a value for a message."""
-    kind = type(value)
-    return _NAMES.get(kind, kind.__name__)
 
 
 def json_text(document: Any) -> str:
