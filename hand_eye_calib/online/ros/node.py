@@ -67,7 +67,8 @@ def _init(arguments: list[str]) -> int:
     try:
         if unknown := remove_ros_args(args=arguments):
             return fail(
-                f"unknown arguments {unknown}; ROS arguments follow --ros-args",
+                f"unknown arguments {unknown}; ROS arguments follow --ros-args, such as "
+                "--ros-args -r parent_odom:=TOPIC -r child_odom:=TOPIC",
                 2,
             )
         rclpy.init(
