@@ -163,6 +163,7 @@ CHANGES = {
     "walk_kurtosis": (0.75, "bursts"),
     "first_jump_sigmas": (10.0, "bursts"),
     "max_outlier_share": (0.4, "bursts"),
+    "centre_ratio": (0.02, "target"),
     "noisy_share": (0.4, "target"),
     "strides": ((5,), "target"),
     "least_gain": (120.0, "drive"),

@@ -101,7 +101,9 @@ def start(problem: Problem) -> Fit:
     duration_s = float(np.ptp(streams.stamps_s))
     centre = "sensors"
     if "centre" not in problem.without:
-        centre = _centre_of_rotations(streams, T, residuals)
+        centre = _centre_of_rotations(
+            streams, T, residuals, tuning.centre_ratio
+        )
     left_out = outliers.jumps | outliers.spikes[1:] | outliers.spikes[:-1]
     return Fit(
         poses=bridge_outliers(streams, T, outliers.spikes),
@@ -117,12 +119,12 @@ def start(problem: Problem) -> Fit:
 
 
 def _centre_of_rotations(
-    streams: Streams, T: FloatArray, residuals: FloatArray
+    streams: Streams, T: FloatArray, residuals: FloatArray, max_ratio: float
 ) -> str:
-    """Return the centre (CENTRES) about which the translations of residuals (n, 6) are smallest.
+    """Return the centre (CENTRES) about which white rotation errors turn.
 
-    White rotation errors turn about this centre. Of both sensors, only the child is tried: the
-    translations of the residuals are those of the child.
+    The centre is the origin of a world if the translations of residuals (n, 6) at this origin are
+    smaller than ``max_ratio`` times those at the sensors.
     """
     translations = residuals[:, :3]
     rotations = residuals[:, 3:]
@@ -135,7 +137,10 @@ def _centre_of_rotations(
         to_origin = se3.translation_of(se3.inverse(poses))
         at_origin = translations + np.cross(rotations, to_origin)
         sizes[world] = median(np.linalg.norm(at_origin, axis=1))
-    return min(CENTRES, key=lambda centre: sizes[centre])
+    smallest = min(CENTRES, key=lambda centre: sizes[centre])
+    if sizes[smallest] < max_ratio * sizes["sensors"]:
+        return smallest
+    return "sensors"
 
 
 def noise(workspace: Workspace, fit: Fit) -> Fit:
