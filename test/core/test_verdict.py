@@ -248,7 +248,7 @@ def test_nothing_against_it_is_use():
     assert (result.verdict, result.reasons) == (Verdict.USE, ())
     assert (
         result.headline
-        == "USE: good to 3 mm along and 0.057 deg about x, y and z (1 sigma)"
+        == "USE: good to 3 mm along and 0.057 deg about each axis (1 sigma)"
     )
 
 

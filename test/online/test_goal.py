@@ -72,7 +72,9 @@ def test_the_session_ends_once_more_motion_has_confirmed_the_targets():
     assert goal.add(result(), seen(50.0)).seconds_left == 30.0
     done = goal.add(result(), seen(80.0))
     assert (done.done, done.limiting_axis, done.seconds_left) == (True, "", 0.0)
-    assert done.sentence.startswith("Done: good to 5 mm and 0.057 deg")
+    assert done.sentence.startswith(
+        "Done: good to 5 mm along and 0.057 deg about each axis"
+    )
 
 
 def test_a_result_beyond_its_target_begins_the_confirmation_anew():

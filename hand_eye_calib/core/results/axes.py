@@ -137,7 +137,7 @@ def what_is_known(result: Result) -> str:
         if _differ_from_angles(result):
             along, about = texts
             return (
-                f"good to {along} along and {about} about x, y and z (1 sigma)"
+                f"good to {along} along and {about} about each axis (1 sigma)"
             )
         return f"good to {listing(texts)} on every axis (1 sigma)"
     within_reach = listing([axis.name for axis in axes])
