@@ -8,12 +8,16 @@ from numpy.testing import assert_allclose
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.alignment.scale import estimate_scale
+from hand_eye_calib.core.checks.check import CheckResult
+from hand_eye_calib.core.checks.clock_and_scale import beside_solved_scale
+from hand_eye_calib.core.checks.findings import finding
 from hand_eye_calib.core.checks.streams import (
     check_lengths,
     is_too_fast,
     is_too_slow,
 )
 from hand_eye_calib.core.checks.units import in_other_units
+from hand_eye_calib.core.engine import poses
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry import se3
 from hand_eye_calib.core.geometry.se3 import deviation
@@ -338,3 +342,41 @@ class TestSmallUnit:
             if finding.makes_unusable
         ]
         assert codes == ["lengths"]
+
+
+@pytest.mark.parametrize(
+    ("key", "is_contradiction"),
+    [("scale", True), ("units", False), ("time_offset", False)],
+)
+def test_a_scale_beside_an_estimated_scale_is_a_contradiction(
+    key, is_contradiction
+):
+    values = {"scale": 1.0765, "sigma": 0.011}
+    found = finding(key, "child", options={"scale": 1.077}, **values)
+    beside = beside_solved_scale(found, 1.0103, 0.0057)
+    assert (beside != found) is is_contradiction
+    if is_contradiction:
+        assert (beside.code, beside.options) == ("scale", {})
+        assert beside.severity is found.severity
+        assert "1.0765 +/- 0.011, the solution by 1.0103 +/- 0.0057" in (
+            beside.what
+        )
+        assert beside.advice.startswith("use a longer part")
+
+
+def test_an_estimate_that_the_check_contradicts_proposes_a_longer_part(
+    hand, monkeypatch
+):
+    """The check computes another scale than the solve of the same streams."""
+    wrong = finding(
+        "scale", "child", options={"scale": 1.08}, scale=1.08, sigma=0.01
+    )
+    monkeypatch.setattr(
+        poses.checking,
+        "check_streams",
+        lambda *_, **__: CheckResult((wrong,)),
+    )
+    for option, key in (("none", "scale"), ("estimate", "scale_contradicted")):
+        snapshot = whole_snapshot(*hand, {"scale": option})
+        checked = poses.check(snapshot, snapshot.estimate(cross_check=False))
+        assert key in [found.key for found in checked.findings]

@@ -1,5 +1,6 @@
 """Options of the commands: help, values, configuration files."""
 
+import argparse
 import dataclasses
 import io
 import json
@@ -9,20 +10,25 @@ from pathlib import Path
 
 import pytest
 from numpy.testing import assert_allclose
+from result_making import good_calibration, written_finding
 from source_code import ROOT
 
 import hand_eye_calib as hec
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.base.option import option_name
 from hand_eye_calib.core.base.registry import COMMANDS
+from hand_eye_calib.core.results.records import Finding, Severity
+from hand_eye_calib.offline.cli import check
 from hand_eye_calib.offline.cli.main import main
 from hand_eye_calib.offline.cli.options import (
     fail,
+    not_typed,
     note,
     typed_options,
     waiting_for,
     with_progress,
 )
+from hand_eye_calib.offline.cli.present import next_steps
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -316,3 +322,64 @@ def test_options_are_printed_as_they_are_typed():
     assert (
         typed == "--prior z=0.50+/-0.02 --max-gap 0.2 --target-translation 0.01"
     )
+
+
+@pytest.mark.parametrize(
+    ("typed", "proposed", "missing"),
+    [
+        ([], ["scale"], ["scale"]),
+        (["--scale", "estimate"], ["scale"], []),
+        (["--scale=estimate"], ["scale"], []),
+        (["--scale", "1.02"], ["scale"], ["scale"]),
+        (["--scale", "estimate"], ["scale", "max_gap"], ["max_gap"]),
+        (["--max-gap", "0.2", "--out", "estimate"], ["scale"], ["scale"]),
+        (["--prior", "z=1.8+/-0.1"], ["prior.z"], []),
+        (["--prior", "y=1.8+/-0.1"], ["prior.z"], ["prior.z"]),
+    ],
+)
+def test_an_option_that_is_typed_already_is_not_proposed_again(
+    typed, proposed, missing
+):
+    values = {"scale": "estimate", "max_gap": 0.2, "prior.z": "1.8+/-0.1"}
+    options = {name: values[name] for name in proposed}
+    assert [*not_typed(typed, options)] == missing
+
+
+@pytest.mark.parametrize(
+    ("typed", "command"),
+    [
+        ("calibrate bag", "hand_eye_calib calibrate bag --scale estimate"),
+        (
+            "calibrate bag --scale 1.1",
+            "hand_eye_calib calibrate bag --scale estimate",
+        ),
+        ("calibrate bag --scale estimate", None),
+        ("calibrate bag --scale=estimate --end 9", None),
+    ],
+)
+def test_the_next_step_is_never_the_command_that_was_run(typed, command):
+    found = Finding(
+        code="scale",
+        key="scale",
+        severity=Severity.ERROR,
+        values={"scale": 1.0765, "sigma": 0.011},
+        options={"scale": 1.077},
+    )
+    calibration = good_calibration(findings=(found,))
+    arguments = argparse.Namespace(typed=typed.split())
+    steps = next_steps(calibration, arguments, None)
+    assert steps == ([command] if command else [])
+
+
+@pytest.mark.parametrize(
+    ("typed", "ending"),
+    [
+        ([], ": calibrate with --scale estimate."),
+        (["--scale", "estimate"], ": check these findings first: scale."),
+    ],
+)
+def test_a_check_proposes_no_option_that_is_typed_already(typed, ending):
+    found = written_finding(
+        "scale", Severity.ERROR, "other", options={"scale": "estimate"}
+    )
+    assert check._verdict([found], typed).endswith(ending)

@@ -106,6 +106,28 @@ def own_unit(
     )
 
 
+def beside_solved_scale(found: Finding, scale: float, sigma: float) -> Finding:
+    """Return a finding about the scale of streams whose scale was estimated by the solve.
+
+    The finding then contradicts the solution, and no option repairs the streams. Other findings are
+    unchanged.
+
+    Parameters
+    ----------
+    found : Finding
+    scale, sigma : float
+        Solution: the factor of the child's lengths and its standard deviation.
+    """
+    if found.key != "scale":
+        return found
+    values: dict[str, Any] = {
+        **found.values,
+        "solved": scale,
+        "solved_sigma": sigma,
+    }
+    return finding("scale_contradicted", found.stream, found.severity, **values)
+
+
 def in_metres(
     findings: Sequence[Finding], units: Sequence[Finding], scale: float
 ) -> list[Finding]:

@@ -263,6 +263,14 @@ WORDS = {
         "find out which sensor has wrong lengths; have the scale estimated (scale estimate), or "
         "set it",
     ),
+    "scale_contradicted": FindingWords(
+        "the check multiplies the child's lengths by {scale:.5g} +/- {sigma:.2g}, the solution by "
+        "{solved:.5g} +/- {solved_sigma:.2g}",
+        "use a longer part of the recording; if the difference remains, the streams contradict "
+        "each other: find out which of the two measures wrongly",
+        "a part that is too short for a scale, or a scale that changes",
+        code="scale",
+    ),
     "one_axis": FindingWords(
         "{axes} cannot be determined from this motion, and will be unknown",
         "rotate about other axes, too (a vehicle: over slopes or kerbs), or measure {it} and give "

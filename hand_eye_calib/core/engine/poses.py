@@ -8,7 +8,10 @@ from hand_eye_calib.core.base.arrays import FloatArray
 from hand_eye_calib.core.base.config import CalibratorConfig
 from hand_eye_calib.core.checks import check as checking
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.clock_and_scale import check_model_scale
+from hand_eye_calib.core.checks.clock_and_scale import (
+    beside_solved_scale,
+    check_model_scale,
+)
 from hand_eye_calib.core.checks.findings import (
     Severity,
     answered,
@@ -76,6 +79,13 @@ def check(
         findings += check_model_scale(
             calibration.scale, calibration.scale_sigma
         )
+    if calibration and config.scale == "estimate":
+        findings = [
+            beside_solved_scale(
+                finding, calibration.scale, calibration.scale_sigma
+            )
+            for finding in findings
+        ]
     findings = answered(findings, config)
     if INVERSIONS & config.given:
         # The user has decided whether both streams are inverse.

@@ -13,6 +13,7 @@ from hand_eye_calib.offline.cli.config_file import options_from
 from hand_eye_calib.offline.cli.options import (
     STREAMS,
     fail,
+    not_typed,
     note,
     print_result,
     typed_options,
@@ -103,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
             "streams": summaries,
             "findings": [item.to_dict() for item in findings],
         }
-    lines = [_verdict(findings), ""]
+    lines = [_verdict(findings, arguments.typed), ""]
     if findings:
         lines += [*_finding_lines(findings), ""]
     lines += _stream_lines(sources, streams)
@@ -190,8 +191,11 @@ def _stream_lines(
         )
 
 
-def _verdict(findings: "Sequence[Finding]") -> str:
-    """Return a sentence with the verdict that a calibration would get, and the next step."""
+def _verdict(findings: "Sequence[Finding]", typed: Sequence[str]) -> str:
+    """Return a sentence with the verdict that a calibration would get, and the next step.
+
+    Options that the command ``typed`` sets already are no next step.
+    """
     from hand_eye_calib.core.results.reasons import Verdict
 
     serious = [
@@ -201,13 +205,11 @@ def _verdict(findings: "Sequence[Finding]") -> str:
         return "No fault found in these streams; run calibrate to see how good the result is."
     errors = [finding for finding in serious if finding.makes_unusable]
     verdict = Verdict.DO_NOT_USE if errors else Verdict.USE_WITH_CARE
-    if all(finding.options for finding in serious):
-        typed = " ".join(
+    if all(not_typed(typed, finding.options) for finding in serious):
+        options = " ".join(
             typed_options(finding.options.items()) for finding in serious
         )
-        return (
-            f"{verdict.value} these streams unchanged: calibrate with {typed}."
-        )
+        return f"{verdict.value} these streams unchanged: calibrate with {options}."
     codes = ", ".join(finding.code for finding in errors or serious)
     return f"{verdict.value}: check these findings first: {codes}."
 

@@ -8,6 +8,7 @@ To make ``--help`` fast, this module imports only the standard library.
 """
 
 import argparse
+import itertools
 import re
 import shlex
 import sys
@@ -152,6 +153,26 @@ def command_with(typed: Sequence[str], options: Options) -> str:
         elif not equals:
             tokens = tokens[1:]
     return f"{shlex.join(['hand_eye_calib', *kept])} {typed_options(options.items())}"
+
+
+def not_typed(typed: Sequence[str], options: Options) -> Options:
+    """Return the options that a command does not set to these values yet.
+
+    Parameters
+    ----------
+    typed : sequence of str
+        Arguments of the command, without the name of the program.
+    options : mapping
+        Options by their public names, and their values.
+    """
+    pairs = [*itertools.pairwise(typed)]
+    missing = {}
+    for name, value in options.items():
+        flag_name, text = shlex.split(typed_options([(name, value)]))
+        is_typed = f"{flag_name}={text}" in typed or (flag_name, text) in pairs
+        if not is_typed:
+            missing[name] = value
+    return missing
 
 
 def _flag_with_axis(name: str, value: str) -> tuple[str, str]:

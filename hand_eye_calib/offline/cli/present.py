@@ -44,6 +44,7 @@ from hand_eye_calib.offline.cli.options import (
     as_typed,
     command_with,
     fail,
+    not_typed,
     note,
     print_result,
     typed_options,
@@ -418,9 +419,13 @@ def next_steps(
     for found in calibration.findings:
         if "scale" in options and "scale" in found.options:
             options["scale"] = options_to_solve(found)["scale"]
-    # A command with a value that the user must still measure would not run.
+    # An option that is set already has not repaired the streams. A command with a value that the
+    # user must still measure would not run.
+    current = snapshot.config.to_options() if snapshot else {}
     options = {
-        name: value for name, value in options.items() if value != PLACEHOLDER
+        name: value
+        for name, value in not_typed(arguments.typed, options).items()
+        if value not in (PLACEHOLDER, current.get(name))
     }
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
