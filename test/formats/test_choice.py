@@ -6,7 +6,11 @@ from hand_eye_calib.core.base.errors import UnclearStreamsError
 from hand_eye_calib.formats.bags.choice import TopicInfo, choose
 from hand_eye_calib.formats.bags.messages import quantities_of_types
 from hand_eye_calib.formats.bags.roles import remarks_on_wheels
-from hand_eye_calib.offline.cli.calibrate import advice_on_topics
+from hand_eye_calib.offline.cli.calibrate import (
+    _other_streams,
+    advice_on_topics,
+)
+from hand_eye_calib.offline.cli.options import typed_options
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -184,6 +188,47 @@ def test_a_topic_of_the_same_sensor_is_not_the_other_stream():
     with pytest.raises(UnclearStreamsError) as caught:
         chosen(rows, frames={**frames, "/imu": "imu_link"})
     assert {*caught.value.options.values()} == {"/odom", "/imu"}
+
+
+@pytest.mark.parametrize(
+    ("frame_of_imu", "text"),
+    [
+        (
+            "base_footprint",
+            "/imu: rates, which give the rotation only: --child-topic /imu "
+            "--child-frame imu_link",
+        ),
+        ("imu_link", "Run: --parent-topic /imu --child-topic /odom"),
+    ],
+)
+def test_a_bag_with_one_odometry_names_every_other_stream(frame_of_imu, text):
+    rows = [
+        ("/odom", ODOMETRY, 900),
+        ("/imu", IMU, 900),
+        ("/joint_states", JOINTS, 900),
+        ("/log", "std_msgs/msg/String", 5),
+    ]
+    frames = {"/odom": "base_footprint", "/imu": frame_of_imu}
+    with pytest.raises(UnclearStreamsError) as caught:
+        chosen(rows, frames=frames)
+    options = typed_options(caught.value.options.items())
+    message = f"{caught.value}. Run: {options}"
+    assert text in message
+    assert "/joint_states" in message
+    described = [
+        {"name": name, "type": type_, "count": count}
+        | {"quantity": quantities_of_types().get(type_, "")}
+        | {"frames": [frames[name]] if name in frames else []}
+        for name, type_, count in rows
+    ]
+    imu, wheels = _other_streams(described)
+    expected = "/imu: rates, which give the rotation only: --child-topic /imu"
+    if frame_of_imu == "base_footprint":
+        expected += " --child-frame imu_link"
+    assert imu == expected
+    assert wheels.endswith(": --parent-topic /joint_states")
+    without_poses = described[1:]
+    assert _other_streams(without_poses) == []
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,18 @@ _LONGEST_LIST = 600
 _FIX = "sensor_msgs/msg/NavSatFix"
 _IMU = "sensor_msgs/msg/Imu"
 
+# Types of topics without poses that can be the other stream: the role of the stream, a likely frame
+# of the sensor, and what the messages determine. Wheels have no frame.
+_OTHER_STREAMS = {
+    _IMU: ("child", "imu_link", "rates, which give the rotation only"),
+    _FIX: ("child", "gnss_link", "positions, which give no rotation alone"),
+    messages.JOINTS_TYPE: (
+        "parent",
+        "",
+        "wheels, if the poses are not computed from the wheels",
+    ),
+}
+
 
 class TopicInfo(NamedTuple):
     """Topic of a bag: its name, its message type and its number of messages.
@@ -213,6 +225,11 @@ def _unclear(
     problem, sources = _problem_and_sources(
         partners, sensors, edges, len(missing)
     )
+    if len(sensors) == 1 and len(missing) > 1:
+        others = [topic for topic in topics if topic.name not in sources]
+        of_own_frame = {topic.name for topic in partners}
+        texts = other_streams(others, of_own_frame)
+        problem = ". ".join([problem, *texts])
     if len(sources) >= len(missing):
         return UnclearStreamsError(problem, _options(missing, sources))
     advice = "record the odometry of the other sensor"
@@ -289,6 +306,30 @@ def _partners_of(
         # Wheels are the parent.
         names = [wheels[0].name, *names]
     return problem, names
+
+
+def other_streams(
+    topics: Sequence[TopicInfo], of_own_frame: Collection[str]
+) -> list[str]:
+    """Return a text about each topic without poses that can be the other stream, with its options.
+
+    Parameters
+    ----------
+    topics : sequence of TopicInfo
+    of_own_frame : collection of str
+        Topics whose messages have another frame than the poses. The user must name the frame of the
+        other topics: the frame in their messages is that of the poses.
+    """
+    texts = []
+    for topic in topics:
+        if topic.type not in _OTHER_STREAMS or not topic.count:
+            continue
+        role, frame, quantity = _OTHER_STREAMS[topic.type]
+        text = f"{topic.name}: {quantity}: --{role}-topic {topic.name}"
+        if frame and topic.name not in of_own_frame:
+            text += f" --{role}-frame {frame}"
+        texts.append(text)
+    return texts
 
 
 def _partial_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:

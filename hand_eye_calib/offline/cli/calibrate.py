@@ -333,8 +333,11 @@ def _table_of_topics(document: "Document") -> list[str]:
             " ".join(row["frames"]),
         ]
         lines.append(_ROW.format(*cells).rstrip())
-    lines.append(advice_on_topics(document["topics"]))
-    return lines
+    advice = advice_on_topics(document["topics"])
+    others = _other_streams(document["topics"])
+    if others:
+        advice += "; the other stream may be:"
+    return [*lines, advice, *others]
 
 
 def advice_on_topics(rows: "Sequence[Document]") -> str:
@@ -353,6 +356,26 @@ def advice_on_topics(rows: "Sequence[Document]") -> str:
     if "frames" in quantities:
         advice += ", or frames of /tf: odom:lidar"
     return advice.replace("accept, or", "accept")
+
+
+def _other_streams(rows: "Sequence[Document]") -> list[str]:
+    """Return lines about the topics without poses that can be the other stream.
+
+    The list is empty if no topic has poses.
+    """
+    from hand_eye_calib.formats.bags.choice import TopicInfo, other_streams
+
+    rows_with_poses = [row for row in rows if row["quantity"] == "poses"]
+    if not rows_with_poses:
+        return []
+    frames: set[str] = set()
+    for row in rows_with_poses:
+        frames |= {*row["frames"]}
+    topics = [TopicInfo(row["name"], row["type"], row["count"]) for row in rows]
+    of_own_frame = {
+        row["name"] for row in rows if frames.isdisjoint(row["frames"])
+    }
+    return other_streams(topics, of_own_frame)
 
 
 def _sensor_frames(bag: "PoseBag", topic: str, frame: str) -> list[str]:
