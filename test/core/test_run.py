@@ -15,6 +15,7 @@ from motions import (
     wandering_poses,
 )
 from numpy.testing import assert_allclose
+from real_data import zxl19
 from scipy.ndimage import uniform_filter1d
 
 import hand_eye_calib as hec
@@ -68,6 +69,18 @@ def test_a_check_states_the_clock_offset_and_the_scale_of_the_solution(streams):
     assert offset["size_s"] == result.time_offset_s
     assert offset["sigma_s"] == result.time_offset_sigma_s
     assert scale["scale"] == result.scale
+
+
+@pytest.mark.parametrize("bag", [1, 2, 3])
+def test_a_check_states_an_offset_that_the_noise_model_estimates_in_part(bag):
+    recording = zxl19(bag, "LO")
+    snapshot = whole_snapshot(recording.parent, recording.child, {})
+    issues = {issue.code: issue for issue in examine(snapshot)}
+    result = hec.calibrate(recording.parent, recording.child)
+    offset = issues["time_offset"].evidence
+    # Both solves end at their own tolerance.
+    assert offset["offset_s"] == pytest.approx(result.time_offset_s, abs=1e-4)
+    assert result.time_offset_s < -0.03
 
 
 def test_an_axis_with_a_prior_is_not_called_unknown():

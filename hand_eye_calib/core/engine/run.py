@@ -23,7 +23,10 @@ from hand_eye_calib.core.base.option import Options
 from hand_eye_calib.core.base.text import with_sigma
 from hand_eye_calib.core.checks import units
 from hand_eye_calib.core.checks.check import CheckResult
-from hand_eye_calib.core.checks.clock_and_scale import offset_values
+from hand_eye_calib.core.checks.clock_and_scale import (
+    check_offset,
+    offset_values,
+)
 from hand_eye_calib.core.checks.findings import (
     Finding,
     Severity,
@@ -510,6 +513,8 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
     result = check(snapshot, calibration)
     applied_s = snapshot.config.given_time_offset_s
     if calibration:
+        if "time_offset" not in snapshot.config.given:
+            result = _with_whole_offset(result, calibration)
         applied_s = calibration.time_offset_s
     reading = _reading_of(snapshot, result, (), applied_s)
     findings = gravest_first((*reading.findings, *reading.doubts))
@@ -527,6 +532,25 @@ def examine(snapshot: Snapshot) -> tuple[Finding, ...]:
             for issue in findings
         )
     return findings
+
+
+def _with_whole_offset(
+    result: CheckResult, calibration: Calibration
+) -> CheckResult:
+    """Return the check with a finding about the whole clock offset, if only the whole is clear.
+
+    The noise model may estimate a part of the offset. The check then measures only the rest, which
+    may be too small for a finding.
+    """
+    rest = result.offset
+    if rest is None or any(
+        item.code == "time_offset" for item in result.findings
+    ):
+        return result
+    whole = replace(rest, seconds=rest.seconds + calibration.time_offset_s)
+    return replace(
+        result, findings=(*result.findings, *check_offset(whole, 0.0))
+    )
 
 
 def _certain(
