@@ -294,7 +294,7 @@ def _articulated(
 
 
 def _mount(rng: np.random.Generator) -> FloatArray:
-    """Return a pose of a sensor that is level to some degrees."""
+    """Return a pose of a sensor that is level within a few degrees."""
     x = rng.uniform(-0.3, 1.0)
     y = rng.uniform(-0.4, 0.4)
     z = rng.uniform(0.2, 1.5)

@@ -92,7 +92,7 @@ def silent(name, level=Level.WARN):
 
 
 def reason(rule, axes):
-    sentence = "the recording contradicts only errors above 12 cm along x, 19 cm y, 40 cm z"
+    sentence = "the recording reveals only errors above 12 cm along x, 19 cm y, 40 cm z"
     return Reason(
         rule.name, rule.verdict, sentence, "compare with a tape", axes
     )
@@ -103,7 +103,7 @@ def judged(rule, axes=("x", "y", "z")):
     problem, step = of_reason(reason(rule, axes))
     verdict = rule.verdict.value
     fact = "Errors larger than 12 cm along x would have been noticed"
-    reasons = ("the recording contradicts only errors above 12 cm: compare",)
+    reasons = ("the recording reveals only errors above 12 cm: compare",)
     return replace(
         RESULT,
         verdict=verdict,

@@ -473,7 +473,11 @@ class _Delay:
         return graded("late", stream, size_m, sigma_m, **values)
 
     def _is_always_error(self, shift_m: float) -> bool:
-        """Return whether the delay is an error even if it is expected or explains little."""
+        """Return whether the delay is an error in any case.
+
+        A large shift is an error even if the delay is expected or explains little. A moderate shift
+        is an error if the delay also explains enough of the residuals.
+        """
         if self.size_s <= max(
             _ALWAYS_ERROR_S, _ALWAYS_ERROR_SIGMAS * self.sigma_s
         ):

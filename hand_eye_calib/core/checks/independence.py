@@ -403,9 +403,9 @@ def _is_steady(aligned: _AlignedPositions) -> bool:
     """
     rows = aligned.regressors(se3.rotation_of(aligned.pose_pairs.Ts_pw_p))
     residuals = _residuals(rows, aligned.differences)
-    corrected = aligned.points + aligned.differences - residuals
+    corrected_points = aligned.points + aligned.differences - residuals
     windows_m = _apart_in_windows(
-        aligned.pose_pairs.stamps_ns, corrected, aligned.others
+        aligned.pose_pairs.stamps_ns, corrected_points, aligned.others
     )
     distances_m = np.linalg.norm(residuals, axis=1)
     return median(distances_m) < _STEADY * windows_m

@@ -57,7 +57,8 @@ _EXPLAINED_SHARE = _OTHER_SHARE / _OTHER_FACTOR
 
 # Quantile of the residuals that is compared. It must lie in the smaller part.
 _EXCHANGE_QUANTILE = 0.85
-# Streams are exchanged if the exchange reduces this quantile of the residuals below this share.
+# The streams were exchanged if this quantile becomes less than this share of its former value when
+# the exchange is undone.
 _EXCHANGE_GAIN = 0.4
 
 

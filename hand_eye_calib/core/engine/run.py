@@ -345,7 +345,7 @@ def _repaired(
 def _solved_as_repaired(
     snapshot: Snapshot, certain_options: Options
 ) -> tuple[Attempt | None, dict[str, float | str]]:
-    """Return the attempt with certain options, and the options that it needs.
+    """Return the attempt with the options of certain repairs, and the options among them it needs.
 
     The time offset is estimated only if otherwise the solve fails.
     """

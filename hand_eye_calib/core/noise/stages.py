@@ -188,7 +188,8 @@ def _detect_in_rounds(
 ) -> Fit:
     """Detect jumps and outlier poses until none of them changes, at most ``rounds`` times.
 
-    Without spikes, only jumps are detected: in this case outlier poses have small weights.
+    With spikes, the fit also stores whether the remaining errors have heavy tails. Without spikes,
+    only jumps are detected: in this case outlier poses have small weights.
     """
     problem = workspace.problem
     tuning = problem.tuning

@@ -270,7 +270,7 @@ def _nearest(
 
 
 def _cloud_of(message: Any) -> _Cloud:
-    """Return at most ``max_points`` points of a PointCloud2 message with their stamps."""
+    """Return at most ``TUNING.max_points`` points of a PointCloud2 message with their stamps."""
     rows = rows_of_points(message)
     points = np.stack([rows[axis] for axis in "xyz"], axis=-1).astype(float)
     times_s, middle_ns = times_of_points(rows, ns_of(message.header.stamp) or 0)

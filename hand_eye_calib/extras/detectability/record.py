@@ -203,8 +203,8 @@ def find_undetectable(result: Any) -> Iterator[Ground]:
             promises[axis] = promised
     if sizes:
         sentence = (
-            f"the recording contradicts only errors above {_amounts(sizes)}; by the standard "
-            f"deviations, it should from {_amounts(promises)}"
+            f"the recording reveals only errors above {_amounts(sizes)}; by its standard "
+            f"deviations, it should reveal errors above {_amounts(promises)}"
         )
         axes = tuple(sizes)
         advice = (

@@ -121,10 +121,9 @@ class VerticalPair:
     def measurement(
         self, calibration: Calibration, snapshot: Any
     ) -> Measurement | None:
-        """Return the measurement, linearised at a result.
+        """Return the measurement, linearised at ``calibration``, or None if it is impossible.
 
-        The result is None if there are no common instants, or if too few sections of the drive have
-        data.
+        Both tracks must have common instants, and enough sections of the drive must have data.
         """
         T = calibration.T_parent_child
         R = se3.rotation_of(T)
@@ -143,6 +142,8 @@ class VerticalPair:
             return None
         means = _means(differences[is_inlier], sections)
         tilt_variance = 0.0
+        # The slope of the road is part of a difference between the ground and the vertical. It
+        # cancels between two tracks of the same kind.
         if parent.source != child.source:
             derivatives = _means(slope_derivatives[is_inlier], sections)
             values, covariance = _fit_with_slope(means, derivatives)

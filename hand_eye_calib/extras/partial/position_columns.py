@@ -46,7 +46,7 @@ _STEP_S = 0.2
 # Prior standard deviation of the smoothing (s^2) of faulty streams. Chosen on simulated machines
 # with filters of 0.05 to 0.2 s. Usual streams have the prior of the noise model.
 _FAULTY_S2 = 0.01
-# Share of faulty streams.
+# Prior probability that a stream is faulty.
 _FAULTY_SHARE = 0.2
 
 # A coordinate with a smaller range (m) is constant, up to rounding.

@@ -144,7 +144,10 @@ def _read_files(arguments: argparse.Namespace) -> _Readings:
 
 
 def _by_frame(readings: _Readings) -> "dict[str, Trajectory]":
-    """Return the trajectories by the frames of their sensors; a ConfigError if frames are equal."""
+    """Return the trajectories by the frames of their sensors.
+
+    Raises a ConfigError if two frames are equal.
+    """
     sensors: dict[str, Trajectory] = {}
     for trajectory, name in zip(
         readings.trajectories, readings.names, strict=True

@@ -227,7 +227,7 @@ def _between(
 def _require_rig(
     trajectories: Mapping[str, Trajectory], options: Mapping[str, Any]
 ) -> None:
-    """Raise an InputError for unusable trajectories, a ConfigError for options of two sensors."""
+    """Raise an InputError or a ConfigError if trajectories or options are not those of a rig."""
     require_type(
         "trajectories",
         trajectories,

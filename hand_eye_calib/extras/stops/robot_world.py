@@ -211,7 +211,7 @@ def _robust_fit(stops: Stops) -> RobotWorld:
 def _likelier_fit(stops: Stops, rests: FloatArray) -> RobotWorld:
     """Return the likelier fit: with errors in the frame of the child, or of its world.
 
-    ``rests`` (N,) are the weights of stops at one place, with 0 for outliers.
+    ``rests`` (N,) are the weights of the stops, smaller for several stops at one place.
     """
     fits = []
     for start in starts_of(stops):
@@ -473,8 +473,8 @@ def _with_lasting_errors(
         lasting += np.einsum("kni,knj->ij", by_values, kernel @ by_values)
     lasting *= (_DEGREES + 6.0) / (_DEGREES + 8.0)
     whitened = np.sqrt(rests)[:, None, None] * weighted
-    longer = _stretch_of(whitened.reshape(-1, 14), lasting, stretch)
-    scores = lasting[:12, :12] + longer.scores
+    of_scale = _stretch_of(whitened.reshape(-1, 14), lasting, stretch)
+    scores = lasting[:12, :12] + of_scale.scores
     # Few stops hardly determine the variances of the errors. The factor covers this uncertainty.
     level_factor = 1.0 + 2.0 / max(3.0 * len(stops) - 0.5 * _N_VALUES, 0.5)
     covariance = level_factor * (
@@ -483,9 +483,9 @@ def _with_lasting_errors(
     return replace(
         fit,
         covariance=covariance,
-        scale_step=longer.step,
-        scale_sigma=longer.sigma * math.sqrt(level_factor),
-        scale_inflation=longer.inflation,
+        scale_step=of_scale.step,
+        scale_sigma=of_scale.sigma * math.sqrt(level_factor),
+        scale_inflation=of_scale.inflation,
     )
 
 

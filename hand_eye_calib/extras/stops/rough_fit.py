@@ -35,9 +35,10 @@ MIN_TURN_RAD = 0.05
 # Smallest divisor. Lengths (m) or angles (rad) of noise-free poses may be zero.
 _TINY = 1e-12
 
-# A mistake is certain if undoing it increases the log likelihood by at least two limits: this
-# constant, and log 2 per coordinate (three per stop), as if the errors were halved. Measured:
-# mistakes in 30 stops of KinHEC with strong noise gain 190 to 400; the limit is 62.
+# A mistake is certain if undoing it increases the log likelihood by at least both limits: this
+# constant, and log 2 per coordinate (three per stop), as if the errors were halved. Measured in 30
+# stops of KinHEC with strong noise: to undo a mistake increases the log likelihood by 190 to 400.
+# The larger limit is 62 for 30 stops.
 _MIN_GAIN = 36.0
 # Limit per coordinate.
 _GAIN_PER_COORDINATE = float(np.log(2.0))

@@ -89,7 +89,7 @@ def _words() -> Any:
 
 
 def _wheels(*file: Any) -> Any:
-    """Read a csv file of wheel data; None for other files."""
+    """Return the table of a csv file of wheel data, or None for other files."""
     from hand_eye_calib.extras.vehicle.wheel_files import table_of_wheels
 
     return table_of_wheels(*file)
@@ -132,7 +132,10 @@ def _add_arguments(parser: Any) -> None:
 
 
 def _is_alone(arguments: Any) -> bool:
-    """Whether the command is for a sensor without wheel data; a ConfigError for several paths."""
+    """Return whether the command is for a sensor without wheel data.
+
+    Raises a ConfigError if such a command has several paths.
+    """
     if arguments.on_vehicle and len(arguments.paths) != 1:
         raise ConfigError(
             "--on-vehicle takes the trajectory file of one sensor; with wheel data leave it out: "

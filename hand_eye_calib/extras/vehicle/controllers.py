@@ -75,8 +75,9 @@ def _of_odometry(wheels: VehicleParameters) -> Controller:
     ]
     if not wheels.nominal_separation_m:
         remarks.append(
-            f"The path of equal radii bends by {fixed(curvature, _DECIMALS)} 1/m; for a multiplier "
-            "of each wheel, calibrate again with --nominal-separation"
+            "The radii of the wheels differ: at equal speeds of both wheels, the path has a "
+            f"curvature of {fixed(curvature, _DECIMALS)} 1/m; for a multiplier of each wheel, "
+            "calibrate again with --nominal-separation"
         )
     values = {
         "wheel_separation_multiplier": separation,

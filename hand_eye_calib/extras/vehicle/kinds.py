@@ -310,13 +310,14 @@ def _note_on_identity(result: Calibration) -> tuple[str, ...]:
 
 
 def _check_size(wheels: VehicleParameters) -> tuple[Finding, ...]:
-    """Return the finding about a wheel of unusual size, or None."""
+    """Return the finding about a wheel of unusual size; empty if the size is usual."""
     # A wheel odometry has a multiplier of the radius, or of the forward motion.
     size = wheels.radius or wheels.parameters[0].value
     nominal = wheels.nominal_radius_m
     if nominal:
-        is_ratio = wheels.is_factor or not wheels.radius
-        ratio = size if is_ratio else size / nominal
+        # A multiplier is the ratio itself. Only a radius in m is divided by the nominal radius.
+        is_in_m = wheels.radius != 0.0 and not wheels.is_factor
+        ratio = size / nominal if is_in_m else size
         if abs(np.log(ratio)) < _USUAL_DEVIATION:
             return ()
         return (
@@ -408,7 +409,7 @@ def _residuals_of(fit: Fit, drive: Drive, start_ns: int) -> Residuals:
 def _check_fit(
     fit: Fit, drive: Drive, config: CalibratorConfig
 ) -> tuple[Finding, ...]:
-    """Return the finding about a fit, or None.
+    """Return the finding about a fit; empty if the fit is good.
 
     Possible findings: the drive does not determine the pose, the wheels are from another drive, the
     sensor seems to be upside down, or its mount moved during the drive.

@@ -48,8 +48,8 @@ from hand_eye_calib.extras.vehicle.drive import (
 # They keep the iteration in bounds. Only the last one, of the slip angle, is real prior knowledge.
 _PRIOR_SIGMAS = (3.0, 3.0, 1.0, 1.0, 1.0, 0.2, 0.004)
 # Prior mean of the slip angle (rad s^2/m). An axle slips outwards, never inwards: by 0.003 to 0.007
-# rad per m/s^2 for cars (2 to 4 deg per g), and by less for slow robots with hard tyres. So both
-# ends are about one standard deviation away from the mean.
+# rad per m/s^2 for cars (2 to 4 deg per g), and by less for slow robots with hard tyres. So 0
+# and 0.007 are about one standard deviation away from the mean.
 _PRIOR_SLIP = 0.003
 # Number of unknowns before the parameters of the wheels.
 N_FIXED = len(_PRIOR_SIGMAS)
@@ -74,9 +74,10 @@ _PITCH = 4
 # Number of blocks of a drive. A block lasts for some seconds, which is longer than a slip.
 BLOCKS = 30
 # Number of blocks of the jackknife; a block of a drive of three minutes lasts 9 s. The omitted part
-# lasts two blocks, which is longer than a curve to each side. Then errors that change sign with the
-# curve, such as those of a leaning body, cancel as in the whole drive. In 76 simulated drives, the
-# standard deviation of roll was 2.0 times the error with 30 blocks, and 1.4 times with 20.
+# lasts two blocks, which is longer than a left and a right curve together. Then errors that change
+# sign with the curve, such as those of a leaning body, cancel as in the whole drive. In 76
+# simulated drives, the standard deviation of roll was 2.0 times the error with 30 blocks, and 1.4
+# times with 20.
 _JACKKNIFE_BLOCKS = 20
 
 # Number of parts of a drive. Two neighbouring parts must not contain most of the information.

@@ -29,7 +29,7 @@ def _add_arguments(group: Any) -> None:
 
 
 def _new_folder(text: str) -> Path:
-    """Return the path of a new folder; a ConfigError if it exists."""
+    """Return the path of a new folder. Raises a ConfigError if the folder exists."""
     path = Path(text)
     if not text.strip():
         raise ConfigError(

@@ -561,10 +561,11 @@ class PoseBag:
     def runs(
         self, topics: Collection[str], span_ns: Span = ALWAYS
     ) -> Iterator[Run]:
-        """Iterate over the messages of topics in the order of bag time, in runs of one kind.
+        """Iterate over the messages of topics, in runs of one kind of message.
 
-        A run has the messages of one kind in a block of a file. Files from the same time are read
-        one after the other. Only messages with a bag time (ns) in ``span_ns`` are read.
+        A run has the messages of one kind in a block of a file, in the order of bag time. The
+        blocks of a file follow each other in time, and the files are read one after the other. Only
+        messages with a bag time (ns) in ``span_ns`` are read.
         """
         start_ns, stop_ns = span_ns
         for storage in self._storages:

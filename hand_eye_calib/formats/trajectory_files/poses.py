@@ -368,7 +368,7 @@ def _of_quaternions(
     quats = _unit_quaternions(table, names)
     if names == QUATERNION:
         return quats
-    # Quaternions with the scalar last, if the scalar of the file is last or first.
+    # The quaternions, converted to scalar last, by the assumed place of the scalar in the file.
     candidates = {"last": quats, "first": np.roll(quats, -1, axis=1)}
     usual, opposite = (
         ("first", "last") if names == SCALAR_FIRST else ("last", "first")

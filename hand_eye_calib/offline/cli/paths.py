@@ -101,7 +101,10 @@ def misplaced(
 
 @argument_type
 def directory(text: str) -> Path:
-    """Return the directory of an option; a ConfigError if the text is empty, or a file is there."""
+    """Return the directory of an option.
+
+    Raises a ConfigError if the text is empty, if the path is a file, or without write permission.
+    """
     if not text.strip():
         raise ConfigError(
             f"the name is empty, got {shown_value(text)}: name a directory"

@@ -266,7 +266,10 @@ def _part_of(
     arguments: Namespace,
     paths: Sequence[Path | str],
 ) -> list[Trajectory]:
-    """Return the part of the trajectories that the user has named; a ConfigError without times."""
+    """Return the part of the trajectories that the user has named.
+
+    Raises a ConfigError if the poses are paired without their times.
+    """
     span = span_from(arguments)
     if span and arguments.pair_by in ("row", "name"):
         raise ConfigError(
@@ -277,7 +280,10 @@ def _part_of(
 
 
 def span_from(arguments: Namespace) -> Span:
-    """Return the part of the recording that the user has named; a ConfigError if it is empty."""
+    """Return the part of the recording that the user has named.
+
+    Raises a ConfigError if the part is empty.
+    """
     return Span.of(arguments.start, arguments.end)
 
 

@@ -374,14 +374,17 @@ def spread_of_position(
     is_unknown = ~np.isfinite(sigmas_m)
     covariance = calibration.covariance[:3, :3]
     if np.isfinite(covariance).all():
-        # An unknown direction need not be parallel to an axis. It is an eigenvector with a huge
-        # variance.
         R = se3.rotation_of(calibration.T_parent_child)
         variances, directions = np.linalg.eigh(R @ covariance @ R.T)
-        is_huge = (variances > UNKNOWN_M**2) & is_unknown.any()
-        if is_huge.any() or not is_unknown.any():
+        if not is_unknown.any():
+            return (directions * variances) @ directions.T, np.empty((0, 3))
+        # An unknown direction need not be parallel to an axis. It is an eigenvector with a huge
+        # variance.
+        is_huge = variances > UNKNOWN_M**2
+        if is_huge.any():
             finite = directions[:, ~is_huge]
             unknown_directions = directions[:, is_huge].T
             return (finite * variances[~is_huge]) @ finite.T, unknown_directions
+    # The unknown directions are the axes without a standard deviation.
     variances_m2 = np.where(is_unknown, 0.0, sigmas_m) ** 2
     return np.diag(variances_m2), np.eye(3)[is_unknown]

@@ -173,8 +173,8 @@ def _display(address: str) -> Iterator[Callable[[View, bool], None]]:
     """Yield a function that displays a view.
 
     Its arguments are a View, and whether to display the QR code of the page's address instead. On a
-    terminal, the view fills the screen. A file or a pipe receives lines; a line that differs from
-    one of the last view only in numbers is not repeated.
+    terminal, the view fills the screen. A file or a pipe receives lines. A line is left out if it
+    differs from a line of the last view only in numbers.
     """
     from rich.live import Live
     from rich.text import Text
