@@ -9,6 +9,7 @@ from node_states import (
     EXTRINSIC,
     FULL,
     INF,
+    NODE,
     REACHED,
     RESULT,
     SAVED,
@@ -39,6 +40,7 @@ from hand_eye_calib.online.live.goal import no_result_in_words
 from hand_eye_calib.online.live.progress import AXIS_KEYS, AxisProgress
 from hand_eye_calib.online.live.state import Level, Standing
 from hand_eye_calib.online.watch import terminal
+from hand_eye_calib.online.watch.board import Board
 from hand_eye_calib.online.watch.view import Tone
 from hand_eye_calib.online.watch.web import fragment
 
@@ -533,3 +535,28 @@ def test_the_end_of_a_short_monitored_session_names_the_missing_digest(
 ):
     ended = replace(mount(is_learning=is_learning), has_ended=True)
     assert ("It wrote no digest" in view_of(ended).advice) == is_learning
+
+
+@pytest.mark.parametrize(
+    ("shared_names", "is_shared"),
+    [((), False), (("/other",), False), ((NODE,), True)],
+)
+@pytest.mark.parametrize(
+    "document",
+    [state(), state(at=REACHED), mount()],
+    ids=["on", "done", "mount"],
+)
+def test_nodes_of_one_name_have_one_headline_and_no_buttons(
+    document, shared_names, is_shared
+):
+    board = Board()
+    board.shared_names = frozenset(shared_names)
+    board.take(document, 0.0)
+    view = board.view(0.5)
+    text = f"Two nodes are named {NODE}."
+    assert (text in view.text) is is_shared
+    if is_shared:
+        assert view.word == "CHECK INPUT"
+        assert view.advice == "Stop one of them, or set another ROS_DOMAIN_ID."
+        assert (view.buttons, view.values, view.saved_in) == ((), (), "")
+        assert list(faults_of(view, document)) == []

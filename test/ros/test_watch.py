@@ -42,6 +42,7 @@ def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
     watcher._node = SimpleNamespace(
         get_topic_names_and_types=lambda: topics,
         create_subscription=lambda kind, topic, *_: heard.append(topic),
+        count_publishers=lambda topic: 1,
     )
     watcher._discover()
     assert 10 < len(heard) == len(watcher._sources) < 100
@@ -143,3 +144,21 @@ def test_one_of_several_nodes_is_chosen_by_name(start_node, start_watch):
     watch = start_watch("--node", "/robot_b/calibrator")
     watch.wait_for("No message on /robot_b/parent_odom yet")
     assert "robot_a" not in watch.seen.read_text()
+
+
+def test_two_nodes_of_one_name_are_one_state_without_requests(
+    start_node, start_watch
+):
+    first = start_node(*QUICK)
+    watch = start_watch()
+    watch.wait_for("No message on /parent_odom yet")
+    second = start_node(*QUICK)
+    watch.wait_for(
+        "! CHECK INPUT: Two nodes are named /calibrator. "
+        "Stop one of them, or set another ROS_DOMAIN_ID."
+    )
+    n_before = len(watch.seen.read_text())
+    second.stop()
+    watch.wait_for(r"ROS_DOMAIN_ID\.\n(.*\n)*.*No message on /parent_odom yet")
+    assert len(watch.seen.read_text()) > n_before
+    assert first.process.poll() is None

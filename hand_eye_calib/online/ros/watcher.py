@@ -103,7 +103,10 @@ class Watcher:
         if request == "acknowledge":
             self._board.acknowledge()
             return
-        if not self._board.node or request in self._requests:
+        node = self._board.node
+        if not node or node in self._board.shared_names:
+            return
+        if request in self._requests:
             return
         now_s = time.monotonic()
         if parameters := self._parameters(request):
@@ -137,7 +140,7 @@ class Watcher:
         return []
 
     def _discover(self) -> None:
-        """Subscribe to the states of new nodes, and list the topics with poses of other nodes.
+        """Subscribe to the states of new nodes, and find shared names and other topics with poses.
 
         Any program may publish a topic called ``progress``. Therefore the number of nodes is
         limited. The list of topics is for a person whose input has no poses.
@@ -158,6 +161,11 @@ class Watcher:
                 self._sources.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
+        self._board.shared_names = frozenset(
+            name
+            for name in self._sources
+            if self._node.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1
+        )
         poses = []
         for topic, types in topics:
             namespace, _, _ = topic.rpartition("/")

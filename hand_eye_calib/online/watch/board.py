@@ -88,10 +88,13 @@ class Board:
     ----------
     topics : tuple of str
         A line for each topic with poses that the displayed node does not use.
+    shared_names : frozenset of str
+        Names that several nodes have. Their states alternate, and a request may reach any of them.
     """
 
     def __init__(self, wanted: str = "") -> None:
         self.topics: Texts = ()
+        self.shared_names: frozenset[str] = frozenset()
         self._wanted = wanted
         # State and answer, each with its time (s). Each pair is one tuple and replaced as a whole,
         # so that no thread combines a state with another time.
@@ -151,6 +154,8 @@ class Board:
                 self._wanted, Tone.UNKNOWN, "NO NODE", f"{text}network?"
             )
         state, received_s = self._newest
+        if state.node in self.shared_names:
+            return _of_shared_name(state.node)
         view = _view(state, now_s - received_s)
         if view.word == MOVED and _alarm_of(state) == self._acknowledged:
             view = replace(
@@ -166,6 +171,17 @@ class Board:
         if self._answer and now_s - self._answer[1] < _ANSWER_FOR_S:
             view = replace(view, answer=self._answer[:1])
         return view
+
+
+def _of_shared_name(node: str) -> View:
+    """Return the view of several nodes with one name, without their values and without buttons."""
+    return View(
+        node,
+        Tone.ACT,
+        "CHECK INPUT",
+        f"Two nodes are named {node}.",
+        "Stop one of them, or set another ROS_DOMAIN_ID.",
+    )
 
 
 def _alarm_of(state: NodeState) -> tuple[str, int | None]:
