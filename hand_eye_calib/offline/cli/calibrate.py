@@ -57,6 +57,7 @@ PATH:
 most used options:
   --list                        show the topics of the bag, and exit
   --parent-topic, --child-topic TOPIC   pose topics of the bag, if it has more than two
+  --start 12 --end 80           use a part, in seconds after both streams have poses
   --out DIR                     save the result, the files for ROS and report.html
   --time-offset estimate        the sensors' clocks differ
   --scale estimate              the child's lengths have no unit (a single camera)
