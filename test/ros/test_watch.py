@@ -36,6 +36,7 @@ def test_of_ten_thousand_names_on_the_network_a_few_are_kept():
     watcher = Watcher.__new__(Watcher)
     watcher._board = Board()
     watcher._sources = set()
+    watcher._shared_since_s = {}
     topics = [
         (f"/n{k}/progress", ["std_msgs/msg/String"]) for k in range(10_000)
     ]

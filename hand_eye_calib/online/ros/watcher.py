@@ -30,6 +30,10 @@ _MAX_NAMES = 20
 # Longest wait (s) for the answer to a request: a node answers within ANSWER_WITHIN_S.
 _MAX_WAIT_S = 3.0 * ANSWER_WITHIN_S
 
+# Two nodes share a name if both are there for longer than this time (s). The middleware drops a
+# killed node only after 20 s (lease of Fast DDS), and it may have been started again.
+_SHARED_AFTER_S = 25.0
+
 
 @dataclass
 class _Request:
@@ -73,6 +77,8 @@ class Watcher:
         self._node.create_timer(REPORT_PERIOD_S, self._discover)
         # Names of the nodes whose state is received.
         self._sources: set[str] = set()
+        # Times (steady, s) since which several nodes have had the same name, by name.
+        self._shared_since_s: dict[str, float] = {}
         # Calls without an answer, by the request of :meth:`ask`.
         self._requests: dict[str, _Request] = {}
         self._discover()
@@ -161,11 +167,7 @@ class Watcher:
                 self._sources.add(name)
                 take = partial(self._take, name)
                 self._node.create_subscription(String, topic, take, LATCHED)
-        self._board.shared_names = frozenset(
-            name
-            for name in self._sources
-            if self._node.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1
-        )
+        self._board.shared_names = self._shared_names(time.monotonic())
         poses = []
         for topic, types in topics:
             namespace, _, _ = topic.rpartition("/")
@@ -180,6 +182,19 @@ class Watcher:
         ]
         self._board.topics = tuple(
             lines or ["no other topic with poses is published here"]
+        )
+
+    def _shared_names(self, now_s: float) -> frozenset[str]:
+        """Return the names that several nodes have, and have had for some time."""
+        for name in self._sources:
+            if self._node.count_publishers(f"{name}/{PROGRESS_TOPIC}") > 1:
+                self._shared_since_s.setdefault(name, now_s)
+            else:
+                self._shared_since_s.pop(name, None)
+        return frozenset(
+            name
+            for name, since_s in self._shared_since_s.items()
+            if now_s - since_s > _SHARED_AFTER_S
         )
 
     def _describe(self, topic: str, type_name: str) -> str:
