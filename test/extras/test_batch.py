@@ -500,6 +500,7 @@ def test_vehicles_are_named_by_their_place_in_the_path(tmp_path):
             (tmp_path / "fleet" / place / "metadata.yaml").touch()
             (tmp_path / "fleet" / place / "a.mcap").touch()
     groups = [[bag] for bag in matching(f"{tmp_path}/fleet/**")]
+    assert groups == [[bag] for bag in matching(f"{tmp_path}/fleet/truck_?")]
     assert groups == [[bag] for bag in matching(f"{tmp_path}/fleet")]
     assert matching(f"{tmp_path}/fleet/truck_2/monday") == [
         f"{tmp_path}/fleet/truck_2/monday"

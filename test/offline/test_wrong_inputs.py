@@ -106,6 +106,8 @@ TABLE = """
 1 | calibrate ms.tum rel.tum | ms.tum: one pose every 50 s for 17 h: its stamps look like
 1 | rig rel.tum rel2.tum ms.tum | its stamps look like milliseconds; give --stamp-unit ms
 1 | calibrate pair | run: hand_eye_calib calibrate pair/lidar.tum pair/camera.tum (parent first)
+1 | check nested | nested itself, but in nested/bag: pass nested/bag, or all bags
+1 | check truth | calibrate truth/lidar.tum truth/camera.tum (parent first)
 1 | check trio | no bag in trio, but 3 trajectory files; for two of them, run: hand_eye_calib calib
 1 | calibrate lidar.tum unstamped.csv | times.txt beside it was taken, because no column of
 1 | calibrate lidar.tum unstamped.csv | name this column t, or give the right stamps with --child
@@ -118,6 +120,10 @@ TABLE = """
 2 | calibrate lidar.tum camera.tum --format kity | invalid choice: 'kity' (choose from 'tum'
 1 | calibrate lidar.tum camera.tum --columns t,x | no column for y, z, qx, qy, qz, qw among t, x
 1 | calibrate lidar.tum camera.tum --pair-by row | 1,200 in camera.tum: write a row
+2 | calibrate lidar.tum camera.tum --pair-by row --time-offset estimate | --pair-by row ignores
+2 | calibrate lidar.tum camera.tum --pair-by name --time-offset 0.1 | --time-offset needs stamps
+2 | check lidar.tum camera.tum --pair-by row --time-offset 0.1 | --time-offset needs stamps, and
+2 | rig lidar.tum camera.tum rel.tum --pair-by row --time-offset 0.1 | --time-offset needs stamps
 1 | calibrate lidar.tum camera.tum --pair-by name | pair by time or row
 2 | calibrate lidar.tum camera.tum --stamp-unit h | choose from 's', 'ms', 'us', 'ns'
 2 | calibrate lidar.tum camera.tum --parent-quaternion zyxw | must be one of xyzw, wxyz, yzwx
@@ -160,6 +166,13 @@ TABLE = """
 2 | batch lidar.tum | lidar.tum is not a bag, and batch takes bags: for trajectory files
 2 | batch lidar.tum camera.tum --vehicle x | use calibrate PARENT CHILD
 2 | batch lidar*.tumx | no file matches lidar*.tumx: check the folder and the name
+2 | batch drive.mcap --vehicle {robot}/* | unknown placeholder {robot}; the
+2 | batch drive.mcap --vehicle f/{Vehicle} | such as 'f/{vehicle}' (see
+2 | batch drive.mcap --vehicle f/{} | the placeholder is {vehicle}, such as 'f/{vehi
+2 | batch drive.mcap --vehicle "f/<robot>" | such as 'f/{vehicle}' (see
+2 | batch drive.mcap --vehicle f/{vehicle | such as 'f/{vehicle}' (see
+2 | batch drive.mcap --vehicle {vehicle}/{day} | {day}; the placeholder is {vehicle}
+2 | batch drive.mcap --vehicle f/* | 'f/*' is a path without {vehicle}; put {vehicle} in place
 2 | batch LIDAR*.tum | no file matches LIDAR*.tum: did you mean lidar.tum? Upper and lower
 2 | check lidar.tum camera.tum --child-topic /a | --child-topic applies to bags only
 1 | info robot.urdf | robot.urdf is a robot description, not a saved result
@@ -175,6 +188,9 @@ TABLE = """
 1 | compare saved --with other.json | in it; pass extrinsic.yaml, a URDF, a bag, or "X Y
 1 | compare saved --with lidar.tum | an installed transform is one pose
 1 | compare saved --with robot.urdf | in the robot description; it has no transforms
+2 | compare saved --with "400 0 1850 0 0 0" | needs a unit: 400 may be m, cm or mm; write 400mm or
+2 | compare saved --with "0 -37.5 0 0 0 0" | write -37.5mm or -37.5m
+2 | calibrate lidar.tum camera.tum --installed "0 0 22 0 0 0" | write 22mm or 22m
 2 | compare saved --with "1 2 3 4 5" | 5 numbers; X Y Z ROLL PITCH YAW are 6
 2 | export saved urdff | did you mean urdf?
 2 | simulate --out new --drive hily | did you mean hilly?
@@ -375,6 +391,11 @@ def write_times(folder, rows):
         for file in ("lidar.tum", "camera.tum", "times.txt"):
             shutil.copy(folder / file, folder / name)
     shutil.copy(folder / "rel.tum", folder / "trio")
+    for name in ("nested", "truth"):
+        shutil.copytree(folder / "pair", folder / name)
+        (folder / name / "a_truth.tum").write_text(lines[0])
+    (folder / "nested" / "bag").mkdir()
+    shutil.copy(folder / "drive.mcap", folder / "nested" / "bag")
 
 
 def write_angles(path, rows, angles):

@@ -94,16 +94,24 @@ def test_bad_value_in_the_file_is_one_line_and_code_1(
 def test_unknown_names_in_the_file_are_warned_about(start_node, tmp_path):
     node = start_node(
         parameter_file(
-            tmp_path / "typo.yaml", treshold=0.02, nonsense=1, threshold=1
+            tmp_path / "typo.yaml",
+            treshold=0.02,
+            nonsense=1,
+            threshold=1,
+            parent_topic="/lidar/odometry",
+            child2_odom="/gnss",
         ),
         *RELIABLE_INPUTS,
     )
     log = node.wait_for_log(
         "parameter treshold does not exist and is ignored; did you mean threshold?",
         "parameter nonsense does not exist",
+        "parent_topic does not exist and is ignored; a topic is set with -r "
+        "parent_odom:=/lidar/odometry",
+        "child2_odom does not exist and is ignored; a topic is set with -r child2_odom:=/gnss",
         "parameters: threshold 1.0",  # written as an integer
     )
-    assert log.count("does not exist") == 2
+    assert log.count("does not exist") == 4
     assert node.stop()[0] == 0
 
 

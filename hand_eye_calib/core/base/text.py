@@ -248,8 +248,8 @@ _QUANTITY = re.compile(
 # Largest length (m) or angle (rad) that a user may type. Squares of larger numbers could overflow.
 _MAX_TYPED = 1e6
 
-# Longest length (m) of a prior without a unit. Sensors are rarely farther apart; 22 without a unit
-# is probably in centimetres.
+# Longest length (m) of a prior or a typed pose without a unit. Sensors are rarely farther apart; 22
+# without a unit is probably in centimetres.
 _MAX_WITHOUT_UNIT_M = 5.0
 
 # Prior on the pose of the child sensor in the parent sensor's frame. For each of x, y, z (m), roll,
@@ -343,10 +343,18 @@ def parse_pose(name: str, text: str) -> tuple[float, ...]:
     Raises
     ------
     ConfigError
-        If the text has another form.
+        If the text has another form, or a length above 5 m has no unit.
     """
     units = [*AXIS_UNITS.values()]
-    return tuple(quantities(name, units, text.split(), "X Y Z ROLL PITCH YAW"))
+    words = text.split()
+    values = quantities(name, units, words, "X Y Z ROLL PITCH YAW")
+    for unit, word, value in zip(units, words, values, strict=True):
+        is_far = unit == "m" and abs(value) > _MAX_WITHOUT_UNIT_M
+        if is_far and not _unit_of(word):
+            raise ConfigError(
+                f"{name} needs a unit: {word} may be m, cm or mm; write {word}mm or {word}m"
+            )
+    return tuple(values)
 
 
 def parse_targets(name: str, text: str) -> dict[str, float]:

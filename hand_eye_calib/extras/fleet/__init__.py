@@ -1,5 +1,6 @@
 """Several recordings: compare their results, combine them, or calibrate a batch."""
 
+import re
 from typing import Any
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -14,6 +15,9 @@ from hand_eye_calib.core.base.registry import (
     ExtraRule,
     Route,
 )
+
+# Position of the vehicle's name in a pattern of paths.
+_PLACEHOLDER = "{vehicle}"
 
 
 def register() -> None:
@@ -67,13 +71,38 @@ def _add_arguments(parser: Any) -> None:
         "the vehicle's name, or its position in the paths of --batch, such "
         "as 'fleet/{vehicle}/*': recordings of one vehicle become one result"
     )
-    add("--vehicle", metavar="PATTERN", help=vehicle)
+    add("--vehicle", metavar="PATTERN", type=_vehicle, help=vehicle)
     no_report = "omit the page of each recording, which takes most of the time"
     add("--no-report", action="store_true", help=no_report)
     jobs = "number of worker processes. Default: one for each core"
     add("--jobs", metavar="N", type=at_least(1), help=jobs)
     dask = "use a Dask cluster in place of local processes: address of its scheduler, tcp://..."
     add("--dask", metavar="ADDRESS", help=dask)
+
+
+def _vehicle(text: str) -> str:
+    """Return the option ``--vehicle``: a name, or a pattern of paths with ``{vehicle}``.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If the text has another placeholder, or is a pattern without a placeholder.
+    """
+    from argparse import ArgumentTypeError
+
+    rest = text.replace(_PLACEHOLDER, "")
+    if other := re.search(r"[{<][^{}<>/]*[}>]?|[}>]", rest):
+        example = text.replace(other[0], _PLACEHOLDER if rest == text else "*")
+        raise ArgumentTypeError(
+            f"unknown placeholder {other[0]}; the placeholder is {_PLACEHOLDER}, such as "
+            f"'{example}'"
+        )
+    if rest == text and re.search(r"[/*?]", text):
+        raise ArgumentTypeError(
+            f"'{text}' is a path without {_PLACEHOLDER}; put {_PLACEHOLDER} in place of the "
+            "vehicle's name"
+        )
+    return text
 
 
 def _is_batch(arguments: Any) -> bool:

@@ -22,7 +22,11 @@ from hand_eye_calib.offline.cli.present import (
     verdict_lines,
     wrapped,
 )
-from hand_eye_calib.offline.cli.reading import read_files, span_from
+from hand_eye_calib.offline.cli.reading import (
+    read_files,
+    refuse_offset_without_stamps,
+    span_from,
+)
 
 if TYPE_CHECKING:
     from hand_eye_calib.core.base.plain import Document
@@ -135,6 +139,7 @@ def _read_topics(arguments: argparse.Namespace) -> _Readings:
 def _read_files(arguments: argparse.Namespace) -> _Readings:
     """Read the trajectories of a rig from a file for each sensor."""
     refuse_options_of_bags(arguments)
+    refuse_offset_without_stamps(arguments, options_from(arguments))
     names = [*map(str, arguments.paths)]
     files = read_files(arguments, arguments.paths, {})
     note(*files.repairs)

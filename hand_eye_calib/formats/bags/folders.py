@@ -45,6 +45,8 @@ _MOST_NAMED = 5
 _TABLES = (".tum", ".csv", ".txt", ".tsv")
 # Largest number of such files that are read in a folder without a bag.
 _MOST_TABLES = 20
+# Smallest number of poses of such a trajectory: the default of min_pairs.
+_FEWEST_POSES = 10
 
 
 def open_bags(paths: Iterable[Path], opened: ExitStack) -> list[Storage]:
@@ -185,6 +187,14 @@ def _no_files(folder: Path) -> str:
             "bag"
         )
     refuse_saved_result(folder)
+    for subfolder in sorted(
+        file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]
+    ):
+        if any(map(_suffix, subfolder.iterdir())):
+            return (
+                f"no bag in {folder} itself, but in {subfolder}: pass {subfolder}, or all bags "
+                f"below: hand_eye_calib batch {folder}"
+            )
     trajectories = _trajectories_in(folder)
     if len(trajectories) > 1:
         task = "run" if len(trajectories) == 2 else "for two of them, run"
@@ -192,20 +202,14 @@ def _no_files(folder: Path) -> str:
             f"no bag in {folder}, but {len(trajectories)} trajectory files; {task}: hand_eye_calib "
             f"calibrate {shlex.join(map(str, trajectories[:2]))} (parent first)"
         )
-    advice = "check the path"
-    for subfolder in sorted(
-        file.parent for file in [*folder.glob("*/*"), *folder.glob("*/*/*")]
-    ):
-        if any(map(_suffix, subfolder.iterdir())):
-            advice = f"pass {subfolder}, or all bags below: hand_eye_calib batch {folder}"
-            break
-    return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; {advice}"
+    return f"no bag in {folder}: expected files that end in {', '.join(REPAIRS)}; check the path"
 
 
 def _trajectories_in(folder: Path) -> list[Path]:
     """Return the files of a folder that are trajectories with stamps, the likeliest parent first.
 
-    Of files with the same stem, only one is returned.
+    Of files with the same stem, only one is returned. A file of a few poses is no trajectory: it
+    may contain an extrinsic.
     """
     trajectories = {}
     candidates = [
@@ -214,7 +218,8 @@ def _trajectories_in(folder: Path) -> list[Path]:
     for path in candidates[:_MOST_TABLES]:
         with suppress(InputError):
             table = read_table(path, FileOptions(format=AUTO))
-            if table.stamps and table.at:
+            has_poses = len(table.rows) >= _FEWEST_POSES
+            if has_poses and table.stamps and table.at:
                 trajectories[path.stem] = path
     stems = parent_and_child([*trajectories], {}, {})
     return [trajectories[stem] for stem in stems]

@@ -1,7 +1,7 @@
 """Find the bags in a folder, or the bags that match a pattern with ``*``."""
 
 from fnmatch import fnmatchcase
-from glob import glob, has_magic
+from glob import escape, glob, has_magic
 from pathlib import Path
 
 from hand_eye_calib.core.base.errors import ConfigError
@@ -71,13 +71,22 @@ def is_other_file(path: str) -> bool:
 
 
 def _local_bags(pattern: str) -> list[str]:
-    """Return the paths on this computer that match a pattern. A plain path is not checked."""
+    """Return the paths on this computer that match a pattern. A plain path is not checked.
+
+    A folder that is not a bag is replaced by the bags below it, if there are any.
+    """
     if not has_magic(pattern) or Path(pattern).exists():
         return [pattern]
     paths = sorted(glob(pattern, recursive=True))
     if "**" in pattern:
-        paths = [path for path in paths if _is_recording(Path(path))]
-    return paths
+        return [path for path in paths if _is_recording(Path(path))]
+    bags = []
+    for path in paths:
+        below = []
+        if _is_folder_of_bags(Path(path)):
+            below = _local_bags(str(Path(escape(path), "**")))
+        bags += below or [path]
+    return [*dict.fromkeys(bags)]
 
 
 def _is_folder_of_bags(path: Path) -> bool:

@@ -229,6 +229,7 @@ def read_files(
     )
 
     streams = streams[: len(paths)] if len(paths) < 3 else [""] * len(paths)
+    refuse_offset_without_stamps(arguments, options)
     if len(paths) > 2:
         _refuse_options_of_two_files(arguments)
     files = []
@@ -259,6 +260,17 @@ def read_files(
     return FilesRead(
         _part_of(trajectories, arguments, paths), repairs, warnings
     )
+
+
+def refuse_offset_without_stamps(
+    arguments: Namespace, options: Options
+) -> None:
+    """Raise a ConfigError if a time offset is set, but poses are paired without their stamps."""
+    if arguments.pair_by in ("row", "name") and "time_offset" in options:
+        raise ConfigError(
+            f"`time_offset` needs stamps, and `pair_by` {arguments.pair_by} ignores them: omit one "
+            "of both"
+        )
 
 
 def _part_of(

@@ -1,5 +1,6 @@
 """Parameters of the node, made from the dataclasses of options."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +27,11 @@ FIELDS = CalibratorConfig.by_name() | _OF_NODE
 
 # Parameters that rclpy declares.
 _SYSTEM_PARAMETERS = ("use_sim_time", "start_type_description_service")
+
+# Names of topics, or of options for topics, that are no parameters: parent_topic, child2_odom ...
+_OF_TOPIC = re.compile(
+    r"(?:(parent|child\d*)_?)?(?:odom|odometry|pose|imu)?_?(?:topics?|odom|odometry)"
+)
 
 
 class Parameters:
@@ -75,8 +81,8 @@ class Parameters:
         for name in overrides:
             node.undeclare_parameter(name)
         self.unknown = [
-            f"parameter {name} does not exist and is ignored{did_you_mean(name, FIELDS)}"
-            for name in overrides
+            f"parameter {name} does not exist and is ignored{_advice(name, value)}"
+            for name, value in overrides.items()
             if name not in FIELDS and not name.startswith("qos_overrides.")
         ]
         # YAML reads the word off without quotes as false.
@@ -116,6 +122,15 @@ class Parameters:
             self.given = self._proposed(parameters)
             self.calibrator, self.node = _configs(self.given)
             self._on_change(before)
+
+
+def _advice(name: str, value: object) -> str:
+    """Return the end of the line about a parameter that does not exist; empty without advice."""
+    match = _OF_TOPIC.fullmatch(name)
+    if not match:
+        return did_you_mean(name, FIELDS)
+    topic = value if isinstance(value, str) and value else "TOPIC"
+    return f"; a topic is set with -r {match[1] or 'parent'}_odom:={topic}"
 
 
 def _checked(values: Options) -> Options:
