@@ -282,9 +282,9 @@ def _is_own(path: Path) -> bool:
         return False
     with open_regular(path) as file:
         beginning = file.read(LONGEST_LINE)
-    return not beginning or (
-        beginning.startswith(b"# {") and _FORMAT.encode() in beginning
-    )
+    if not beginning:
+        return True
+    return beginning.startswith(b"# {") and _FORMAT.encode() in beginning
 
 
 def _open_no_link(path: str, flags: int) -> int:

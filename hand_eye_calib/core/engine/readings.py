@@ -131,16 +131,12 @@ def decide(
     if has_late_stamps and readings.by_shape != 0:
         by_noise = 0
     choice = _clear_choice(readings, by_noise)
-    can_be_right = readings.hypotheses[0].is_uninverted
-    if (
-        choice == 1
-        and can_be_right
-        and has_late_stamps
-        and readings.by_shape <= 0
-    ):
+    is_first_uninverted = readings.hypotheses[0].is_uninverted
+    is_inverted_by_noise = choice == 1 and readings.by_shape <= 0
+    if is_first_uninverted and has_late_stamps and is_inverted_by_noise:
         # Without this rule, an excavator with late stamps was read as inverse, 5 m off.
         return None
-    if choice == 0 and can_be_right:
+    if is_first_uninverted and choice == 0:
         # If nothing is clear, keep the streams as they are, unless a criterion is evidence for
         # inversion.
         is_inversion_supported = readings.shape >= 0.0 or by_noise > 0

@@ -107,7 +107,8 @@ def first_outliers(
     spikes = np.r_[False, is_large[1:] & is_large[:-1], False]
     if np.mean(spikes) > tuning.max_outlier_share:
         return Outliers(is_large, np.zeros(len(spikes), dtype=bool))
-    jumps = is_large & ~(spikes[1:] | spikes[:-1])
+    is_beside_spike = spikes[1:] | spikes[:-1]
+    jumps = is_large & ~is_beside_spike
     if spikes.any():
         poses = bridge_outliers(streams, T_parent_child, spikes)
         bridged_residuals = first_residuals(poses, course, T_parent_child)
@@ -223,12 +224,14 @@ def detect_outliers(
     )
     at_either_end = np.maximum(of_white[1:], of_white[:-1])
     is_new = _is_peak(of_walk) & (of_walk >= at_either_end) & ~outliers.jumps
-    jumps = (of_walk > jump_threshold) & (outliers.jumps | is_new)
+    may_be_jump = outliers.jumps | is_new
+    jumps = may_be_jump & (of_walk > jump_threshold)
     spikes = outliers.spikes
     if with_spikes:
         on_either_side = np.maximum(np.r_[0.0, of_walk], np.r_[of_walk, 0.0])
         is_largest = _is_peak(of_white) & (of_white > on_either_side)
-        spikes = spikes | (of_white > threshold) & is_largest
+        is_new_spike = is_largest & (of_white > threshold)
+        spikes = spikes | is_new_spike
     return Outliers(jumps, spikes)
 
 

@@ -138,6 +138,7 @@ def _check_moving(
         [] if is_unrelated else check_position(lever_arm, sigmas, priors)
     )
     if fitted and _is_copied(fitted, positions):
+        # If the lever arm is zero, too, both streams are from one sensor.
         evidence = "The positions agree with the poses to rounding"
         return as_errors(no_lever_arm) or copied(
             evidence, residual_m=fitted.residual

@@ -240,10 +240,11 @@ def check_rotation(
         Whether a stream has rates. The finding is then an error. Otherwise it is a warning, because
         the axes of two cameras may well be parallel.
     """
-    limit_rad = agreement.MAX_SIGMA_RAD
+    if {"roll", "pitch", "yaw"} & {*priors}:
+        return []
     # The standard deviations must be small on all axes. If two level sensors turn only about the
     # vertical, yaw is unobservable, and roll and pitch are zero for any two sensors.
-    if {"roll", "pitch", "yaw"} & {*priors} or not sigmas.max() < limit_rad:
+    if not sigmas.max() < agreement.MAX_SIGMA_RAD:
         return []
     angles_rad = np.abs(se3.rotation_log(rotation))
     limits_rad = np.maximum(agreement.SAME_RAD, agreement.ZERO_SIGMAS * sigmas)

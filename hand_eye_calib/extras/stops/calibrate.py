@@ -224,12 +224,12 @@ def _calibrated_arm(
     solved = solve_checked(poses, config, setup)
     setup_fit = solved.setup_fit
     solved = solved.adding(*_check_setup(setup_fit, setup))
-    if setup_fit.is_inverse and not (
-        poses.has_target or setup or config.given & _INVERSIONS
-    ):
+    is_declared = poses.has_target or setup or config.given & _INVERSIONS
+    if setup_fit.is_inverse and not is_declared:
         solved = solved.adding(finding("beside_or_inverse", "child"))
     warnings = list(solved.warnings)
-    if solved.is_usable and not config.given >= _INVERSIONS:
+    has_both_inversions = config.given >= _INVERSIONS
+    if solved.is_usable and not has_both_inversions:
         if not setup:
             warnings.append(_setup_in_words(setup_fit, config))
         solved = solved.adding(*_check_distances(setup_fit, named, config))

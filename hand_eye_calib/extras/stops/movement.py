@@ -98,7 +98,8 @@ def check_movement(
     is_clear = movement.squared > _MIN_SQUARED + _MIN_SQUARED_TIMES_STOPS / len(
         sampled
     )
-    if not is_clear or (shift_m < _MIN_SHIFT_M and turn_rad < _MIN_TURN_RAD):
+    is_small = shift_m < _MIN_SHIFT_M and turn_rad < _MIN_TURN_RAD
+    if is_small or not is_clear:
         return None
     return finding(
         "moved_stops",

@@ -318,6 +318,7 @@ def _likelier_setup(
     if setup is None:
         setup_fits.sort(key=lambda setup_fit: setup_fit.fit.objective)
     elif setup == "beside":
+        # The first fit is that of a camera on the hand.
         setup_fits.reverse()
     chosen, other = setup_fits
     return replace(chosen, lead=other.fit.objective - chosen.fit.objective)
@@ -417,9 +418,9 @@ def _with_movement(
     other errors may look like a movement.
     """
     others = [issue for issue in findings if issue.key != "disagreeing_stops"]
-    if has_error(others) or not (
-        poses.has_positions and turns_about_two_axes(poses.parent)
-    ):
+    if has_error(others) or not poses.has_positions:
+        return findings
+    if not turns_about_two_axes(poses.parent):
         return findings
     moved = check_movement(setup_fit.stops, setup_fit.fit, poses.is_arm)
     return [moved, *others] if moved else findings

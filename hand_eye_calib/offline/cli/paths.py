@@ -44,11 +44,13 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
             )
         if isinstance(path, Path):
             refuse_saved_result(path)
-    last = Path(paths[-1]) if len(paths) == 3 else None
-    if last and not (last.suffix or last.exists() or "*" in str(last)):
-        raise ConfigError(
-            f"no file {last}; to save the result in a folder, give --out {last}"
-        )
+    if len(paths) == 3:
+        last = Path(paths[-1])
+        may_be_input = last.suffix or last.exists() or "*" in str(last)
+        if not may_be_input:
+            raise ConfigError(
+                f"no file {last}; to save the result in a folder, give --out {last}"
+            )
     if (
         command == "replay"
         and len(paths) > 1

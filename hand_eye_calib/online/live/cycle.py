@@ -184,7 +184,8 @@ class SolveCycle:
         has_same_values = replace(before, **targets) == config
         others_before = before.given.difference(_TARGETS)
         has_same_names = others_before == config.given.difference(_TARGETS)
-        if result is None or not (has_same_values and has_same_names):
+        have_only_targets_changed = has_same_values and has_same_names
+        if result is None or not have_only_targets_changed:
             self.goal.follow(config.targets)
             return
         targets["target_axes"] = parse_targets(

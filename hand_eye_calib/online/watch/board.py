@@ -125,11 +125,14 @@ class Board:
 
         ``now_s`` is the time (s) on a steady clock at which the state was received.
         """
-        is_silent = (
-            not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
-        )
-        is_displayed = state.node == (self._wanted or self.node)
-        if is_displayed or (is_silent and not self._wanted):
+        if self._wanted:
+            is_displayed = state.node == self._wanted
+        else:
+            is_silent = (
+                not self._newest or now_s - self._newest[1] > _SILENT_AFTER_S
+            )
+            is_displayed = is_silent or state.node == self.node
+        if is_displayed:
             self._newest = state, now_s
 
     def answer(
@@ -316,9 +319,10 @@ def _facts(state: NodeState, is_old: bool) -> str:
     )
     is_paused = any(stream.is_paused for stream in state.inputs.values())
     is_refuted = extrinsic.standing is Standing.REFUTED
-    has_age = extrinsic.result and not (is_old or is_paused or is_refuted)
-    if extrinsic.result and has_age and extrinsic.result.age_s >= _MIN_AGE_S:
-        facts += f", result {duration(extrinsic.result.age_s)} old"
+    is_without_age = is_old or is_paused or is_refuted
+    result = extrinsic.result
+    if result and result.age_s >= _MIN_AGE_S and not is_without_age:
+        facts += f", result {duration(result.age_s)} old"
     if extrinsic.standing is Standing.OUTDATED:
         facts += ", newer solves fail"
     return facts
