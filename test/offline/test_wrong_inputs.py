@@ -468,6 +468,16 @@ def test_a_yaw_that_counts_turns_is_read_in_radians_with_a_note(tmp_path):
     assert_allclose(np.sin(rotation.magnitude()), abs(np.sin(40.0)))
 
 
+@pytest.mark.parametrize("factor", ["0.001", "0.01"])
+def test_a_factor_that_the_lengths_do_not_need_is_the_first_reason(run, factor):
+    paths = ("sample:lidar.tum", "sample:camera.tum")
+    _, out, _ = run("calibrate", *paths, "--parent-scale", factor)
+    words = " ".join(out.split())
+    assert f"the parent's lengths were multiplied by {factor}, as" in words
+    assert "omit the factor if the parent's lengths are metres: --par" in words
+    assert "give positions of the child sensor itself" not in words
+
+
 def test_a_folder_may_be_called_sample():
     assert local_path("sample") == Path("sample")
     assert local_path("sample/lidar.tum") == Path("sample/lidar.tum")

@@ -296,6 +296,12 @@ WORDS = {
         "for example positions from the other sensor, or positions of another point of the robot "
         "than the sensor",
     ),
+    "given_factor": FindingWords(
+        "the parent's lengths were multiplied by {factor:g}, as given, but both streams agree in "
+        "length without this factor; with it, the sensors are only {size} apart",
+        "omit the factor if the parent's lengths are metres",
+        code="same_position",
+    ),
     "rotation_gain": FindingWords(
         "the child rotates {gain:.4f} +/- {sigma:.4f} times as far as the parent about ({axis}) in "
         "the parent sensor's frame",

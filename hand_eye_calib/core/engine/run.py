@@ -54,6 +54,7 @@ from hand_eye_calib.core.engine.poses import INVERSIONS
 from hand_eye_calib.core.engine.snapshot import UNASKED_S, Snapshot
 from hand_eye_calib.core.engine.solved_values import (
     note_on_unit,
+    with_given_factor,
     with_solved_offset,
     with_solved_scale,
 )
@@ -142,6 +143,13 @@ def run(
         if note := note_on_unit(snapshot):
             messages = [OptionMessage(note, note), *best.messages]
             best = best.with_messages(best.options, messages)
+            factor = snapshot.config.parent_scale
+            findings = tuple(
+                with_given_factor(found, best.calibration, factor)
+                for found in best.check.findings
+            )
+            if findings != best.check.findings:
+                best = best.with_findings(findings)
     report(1.0, "done")
     return best
 

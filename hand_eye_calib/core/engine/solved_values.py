@@ -5,9 +5,14 @@ from dataclasses import replace
 from hand_eye_calib.core.base.text import with_sigma
 from hand_eye_calib.core.checks.clock_and_scale import offset_values
 from hand_eye_calib.core.checks.findings import Finding
+from hand_eye_calib.core.checks.findings import finding as new_finding
 from hand_eye_calib.core.checks.streams import is_too_fast, is_too_slow
 from hand_eye_calib.core.engine.snapshot import Snapshot
 from hand_eye_calib.core.results.calibration import Calibration
+
+# Two streams agree in length if the ratio of their lengths differs from 1 by less: the scale error
+# of odometry.
+_SAME_LENGTHS = 0.05
 
 
 def with_solved_scale(finding: Finding, calibration: Calibration) -> Finding:
@@ -36,6 +41,27 @@ def with_solved_offset(finding: Finding, calibration: Calibration) -> Finding:
     options = {"time_offset": values["total_s"]}
     return replace(
         finding, values={**finding.values, **values}, options=options
+    )
+
+
+def with_given_factor(
+    finding: Finding, calibration: Calibration, factor: float
+) -> Finding:
+    """Return a finding about sensors in one place with its cause: a factor that the user gave.
+
+    The finding is unchanged if the streams disagree in length without the parent's factor.
+    """
+    ratio = calibration.scale / factor
+    is_same = finding.key in ("same_position", "same_frame")
+    if not is_same or abs(ratio - 1.0) > _SAME_LENGTHS:
+        return finding
+    return new_finding(
+        "given_factor",
+        "parent",
+        finding.severity,
+        {"parent_scale": 1.0},
+        **finding.values,
+        factor=factor,
     )
 
 
