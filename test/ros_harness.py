@@ -61,6 +61,7 @@ RELIABLE_INPUTS = [
 ]
 
 _domains = itertools.count(os.getpid())
+# Sockets (TCP) that hold the domains in use.
 _held = {}
 
 
@@ -70,21 +71,28 @@ def values_of(status):
 
 
 def free_domain():
-    """A domain id whose first participant's port nobody listens on."""
+    """A domain id that nobody uses, held until :func:`release_domain` or the end of the process.
+
+    A socket at the port of the first participant holds the domain against other test runs. The
+    participants alone would not: after the first one ends, its port is free.
+    """
     for candidate in itertools.islice(_domains, 100):
         # Above 101, the ports overlap with those that Linux gives to clients.
         domain = 1 + candidate % 100
+        port = 7410 + 250 * domain
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
-                probe.bind(("", 7410 + 250 * domain))
-                # Held for a while: the tests may run in two interpreters at once.
-                _held[candidate % 10] = socket.create_server(
-                    ("", 7410 + 250 * domain)
-                )
+                probe.bind(("", port))
+                _held[domain] = socket.create_server(("", port))
             except OSError:
                 continue
         return domain
     raise RuntimeError("no free ROS domain")
+
+
+def release_domain(domain):
+    """Let others use a domain."""
+    _held.pop(domain).close()
 
 
 def drive(

@@ -6,7 +6,7 @@ from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
-from ros_harness import NodeProcess, Peer, free_domain
+from ros_harness import NodeProcess, Peer, free_domain, release_domain
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -26,7 +26,9 @@ def _quick_discovery():
 
 @pytest.fixture
 def domain():
-    return free_domain()
+    reserved = free_domain()
+    yield reserved
+    release_domain(reserved)
 
 
 @pytest.fixture
