@@ -218,8 +218,8 @@ def _filled_layout(result: Judged, name: str) -> str:
     T = result.T_parent_child
     arrangement = arranged(formats()[name], *frames)
     layout = arrangement.layout
-    # The target of this layout is a vehicle or robot. Prefer the frame that its description
-    # contains.
+    # The parent of this layout is the vehicle. Its frame is in the robot's description; the pose in
+    # this frame (``mounting``) replaces the pose in the frame of the parent sensor.
     if layout.is_inverted is False and not layout.target:
         frames = (result.mounting[0], result.child_frame)
         T = result.mounting[1]

@@ -163,6 +163,7 @@ def agreement_of(
     scattered = stated + np.diag(usual_scatter**2)
     weights = np.linalg.inv(scattered)
     best = int(np.argmax(np.trace(weights, axis1=1, axis2=2)))
+    # Combine all results. Their covariances contain the usual scatter.
     no_scatter = np.zeros(6)
     first_guess = Ts_parent_child[best]
     of_all = _common(
@@ -171,10 +172,12 @@ def agreement_of(
     start = of_all.T_parent_child
     errors = deviation(Ts_parent_child, start)
     explanation = _explain(errors, weights, level)
+    # Combine the results that agree, and estimate their scatter.
     belongs = ~explanation.apart
     common = _common(
         Ts_parent_child[belongs], stated[belongs], usual_scatter, start
     )
+    # At level 0, no result is set apart.
     rest = _explain(errors[belongs], weights[belongs], 0.0)
     sigmas = np.sqrt(np.diagonal(scattered, axis1=1, axis2=2))
     sigmas = np.where(sigmas < UNOBSERVABLE, sigmas, np.nan)

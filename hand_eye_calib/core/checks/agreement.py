@@ -110,7 +110,7 @@ _ALWAYS_ERROR_S = 0.04
 _ALWAYS_ERROR_SIGMAS = 8.0
 _ALWAYS_ERROR_SHIFT_M = 0.02
 _ALWAYS_ERROR_SHARE = 0.35
-# Multiple of the error limit that makes a fault an error, just above the limit.
+# Size of a fault that must be an error, as a multiple of the error limit: just above the limit.
 _JUST_ABOVE = 1.001
 
 # Smallest smoothing (s^2) that is reported. For the definition see the module fault_regression.

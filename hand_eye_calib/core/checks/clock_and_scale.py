@@ -47,7 +47,10 @@ def check_offset(offset: TimeOffset, added_s: float) -> list[Finding]:
 
 
 def offset_values(offset_s: float, added_s: float = 0.0) -> dict[str, Any]:
-    """Return the values of a finding about a clock offset: ``added_s`` plus ``offset_s`` (s)."""
+    """Return the values of a finding about a clock offset ``offset_s`` (s).
+
+    ``total_s`` (s) is its sum with ``added_s`` (s), the offset that was added before.
+    """
     values: dict[str, Any] = {"offset_s": offset_s, "size_s": abs(offset_s)}
     values["direction"] = "behind" if offset_s > 0 else "ahead of"
     return values | {"total_s": round(added_s + offset_s, 4)}

@@ -257,8 +257,9 @@ def answered(
     for found in findings:
         options = dict(found.options)
         if found.code in CONVENTIONS:
-            # If the configuration already corrects a stream, and the check asks for the same
-            # correction, the recorded stream was right. The finding then proposes the defaults.
+            # The checks examine the streams after the corrections of the configuration. If a check
+            # asks for a correction that was already made, this correction was the mistake: propose
+            # the default in its place.
             repeated = [
                 name
                 for name, value in options.items()

@@ -298,8 +298,9 @@ def _variances(
 ) -> FloatArray:
     """Estimate the variances (2,) per axis of positions (m^2) and rotations (rad^2).
 
-    Four stops or fewer do not determine both variances: the positions may fit exactly. Then the
-    variance of positions is the variance of rotations times the variance of the child's positions.
+    Four stops or fewer do not determine both variances: the positions may fit exactly. Then both
+    are assumed to be proportional: the variance of positions is the variance of rotations times the
+    variance of the child's positions. The factor is estimated from both errors.
 
     Parameters
     ----------
@@ -323,7 +324,8 @@ def _variances(
             se3.translation_of(stops.Ts_world_child).var(axis=0).sum()
             + MIN_VARIANCE
         )
-        means = means @ [0.5 / places_m2, 0.5] * np.array([places_m2, 1.0])
+        factor = means @ [0.5 / places_m2, 0.5]
+        means = factor * np.array([places_m2, 1.0])
     return np.maximum(means, MIN_VARIANCE)
 
 

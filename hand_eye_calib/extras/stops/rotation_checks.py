@@ -380,7 +380,10 @@ def _angle_kind(
     text: str,
     angles_of_other: FloatArray,
 ) -> _AngleKind:
-    """Return a kind of angles, with its rotations (N, 3, 3) of ``stream`` compared."""
+    """Return a kind of angles, compared with the angles (N,) of the other stream.
+
+    ``rotations`` (N, 3, 3) are the rotations of ``stream``, read as this kind.
+    """
     positions = se3.translation_of(getattr(sample, stream))
     reread = se3.from_rotation_translation(rotations, positions)
     difference_rad = median_difference(angles_between(reread), angles_of_other)

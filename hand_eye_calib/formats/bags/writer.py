@@ -29,10 +29,10 @@ def write_bag(
     path : str or Path
         Directory of the bag; for rosbag1, the ``.bag`` file. It must not exist.
     streams : mapping of str to (Trajectory, str)
-        Trajectory and message type of each topic: Odometry and TFMessage, which contain the
-        sensor's frame, PoseStamped, or Path, which is one message of all poses. The stamps of the
-        trajectory are header stamps and bag times. Subscribers that join late also receive a
-        topic of one message.
+        Trajectory and message type of each topic: Odometry, TFMessage, PoseStamped or Path. Only
+        Odometry and TFMessage contain the sensor's frame. A Path is one message with all poses.
+        The stamps of the trajectory are header stamps and bag times. Subscribers that join late
+        still receive topics of one message.
     storage : {"mcap", "sqlite3", "rosbag1"}
 
     Raises

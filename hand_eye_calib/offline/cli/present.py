@@ -342,8 +342,11 @@ def _mixed_axes(transforms: "Mapping[str, Notation]", name: str) -> str:
         for axis, is_known in zip(TRANSLATIONS, are_known, strict=True)
         if not is_known
     ]
-    verb = "contains" if len(mixed) == 1 else "contain"
-    return f"here {listing(mixed)} {verb} a part of the unknown {listing(unknown)}, by the tilt"
+    verb = "depends" if len(mixed) == 1 else "depend"
+    return (
+        f"in this frame, {listing(mixed)} also {verb} on the unknown {listing(unknown)}: the "
+        "frames are tilted against each other"
+    )
 
 
 def _clock_and_scale_lines(

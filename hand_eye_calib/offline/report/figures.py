@@ -1,6 +1,6 @@
 """Draw the figures of the report, each with a caption in words and numbers.
 
-A caption only states sizes. The verdict has its own rules.
+A caption states values and does not judge them. Only the verdict judges, by its own rules.
 """
 
 from collections.abc import Sequence

@@ -19,7 +19,8 @@ _STYLES = {
 # Length of a progress bar, in columns.
 _BAR_LENGTH = 16
 
-# Smallest width of a terminal (columns) with the last column of the bars.
+# Smallest width of a terminal (characters). A narrower one does not display the texts after the
+# bars.
 _MIN_WIDTH = 76
 
 # Largest number of reasons that are displayed.
