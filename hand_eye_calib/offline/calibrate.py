@@ -29,7 +29,10 @@ from hand_eye_calib.core.engine.cross_check import (
 from hand_eye_calib.core.engine.run import Progress, run
 from hand_eye_calib.core.engine.snapshot import whole_snapshot
 from hand_eye_calib.core.geometry.span import Span
-from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.core.geometry.trajectory import (
+    Trajectory,
+    TrajectoryLike,
+)
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.core.results.records import CrossCheck
 from hand_eye_calib.formats.files import path_of
@@ -233,6 +236,12 @@ def _read_both(
                 f"{stream}_topic is a topic of a bag: pass only the bag, no child"
             )
     if isinstance(parent, Trajectory) and isinstance(child, Trajectory):
+        from hand_eye_calib.formats.trajectory_files.stamps import (
+            require_nanoseconds,
+        )
+
+        require_nanoseconds("the parent", parent)
+        require_nanoseconds("the child", child)
         return parent, child
     from hand_eye_calib.formats.trajectory_files.reading import (
         read_trajectories,

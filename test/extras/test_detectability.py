@@ -244,6 +244,28 @@ def test_sizes_that_are_unlimited_are_not_in_the_sentences(result):
     assert "clocks" not in fact
 
 
+@pytest.mark.parametrize(
+    ("errors", "sentence"),
+    [
+        (
+            dict.fromkeys(AXES, np.inf),
+            "reveals no error in x, y, z and the rot",
+        ),
+        (
+            dict.fromkeys(AXES, 0.0) | {"x": 1.0, "yaw": np.inf},
+            "only errors above 1 m along x and no error in the rotation about z;",
+        ),
+    ],
+)
+def test_an_axis_whose_errors_are_never_revealed_is_named(
+    result, errors, sentence
+):
+    sizes = replace(result.detectability, errors=errors)
+    (ground,) = find_undetectable(result.with_part("detectability", sizes))
+    assert sentence in ground.sentence
+    assert "above ;" not in ground.sentence
+
+
 def test_a_prior_is_no_reason_for_care(result):
     """A prior determines more than the motion can contradict."""
     nothing_shows = replace(

@@ -36,6 +36,8 @@ TABLE = """
 1 | calibrate far.tum camera.tum | line 1: position (1e+12,
 1 | calibrate same_stamp.tum camera.tum | 600 poses have 5 different stamps; write all digits
 1 | calibrate lidar.tum nohead.csv | name the 4 columns with --child-columns
+1 | calibrate polish.csv camera.tum | names: Wysokość (m), Alfa (°), Beta (°), Gamma (°); name all
+1 | calibrate lidar.tum polish.csv | --child-columns, such as t_s,x_m,y_m,z_m,roll_deg,pitch_deg,y
 1 | calibrate apart/clock.csv camera.tum | name their column t (is it Uhr or Rest?), or set
 1 | calibrate lidar.tum camera.tum few0.tum | few0 (child) with lidar (parent): 10 synchronised
 1 | calibrate lidar.tum half.tum half2.tum | half and half2 have 0 poses at common times
@@ -275,6 +277,8 @@ TEXTS = {
     "commas.csv": "t,x,y,z\n" + "1,5,0,25,3,125,-4,5\n" * 20,
     "commas.txt": "1,5,0,25,3,125,-4,5,1,5,0,25,3,125,-4,5\n" * 20,
     "other.json": '{"a": 1}',
+    "polish.csv": "Zeit (s);X (m);Y (m);Wysokość (m);Alfa (°);Beta (°);Gamma (°)\n"
+    + "1;2;3;4;5;6;7\n" * 20,
     "kitti.txt": "1 0 0 0 0 1 0 0 0 0 1 0\n" * 20,
     "times.txt": "0\n1\n",
     "bad.yaml": "a: [1\n",

@@ -11,6 +11,20 @@ import hand_eye_calib as hec
 SAMPLES = hec.read_arm_samples("sample:arm.yaml")
 LIDAR = hec.read_trajectory("sample:lidar.tum")
 RESULT = hec.calibrate(LIDAR, hec.read_trajectory("sample:camera.tum"))
+
+
+def with_last_row(number, row):
+    """Return the poses of the lidar, of which one has another last row."""
+    poses = LIDAR.poses.copy()
+    poses[number, 3] = row
+    return poses
+
+
+def with_stamps_in(unit_ns):
+    """Return the trajectory of the lidar with stamps in a unit of a number of nanoseconds."""
+    return hec.Trajectory(LIDAR.stamps_ns // unit_ns, LIDAR.poses)
+
+
 IN_PYTHON = {
     "no child": (
         lambda: hec.calibrate(LIDAR),
@@ -23,6 +37,26 @@ IN_PYTHON = {
     "positions as poses": (
         lambda: hec.Trajectory(LIDAR.stamps_ns, LIDAR.poses[:, :3, 3]),
         "for positions alone, use Trajectory.from_positions",
+    ),
+    "rows of poses": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns, np.ones((len(LIDAR), 7))),
+        "Trajectory.from_quat_xyzw(stamps_ns, rows[:, :3], rows[:, 3:])",
+    ),
+    "transposed poses": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns, LIDAR.poses.transpose(0, 2, 1)),
+        "1: the poses seem to be transposed; pass poses.transpose(0, 2, 1)",
+    ),
+    "another last row": (
+        lambda: hec.Trajectory(LIDAR.stamps_ns, with_last_row(3, [0, 0, 1, 1])),
+        "pose 3: the last row must be 0 0 0 1; found 0 0 1 1: is it a pose",
+    ),
+    "stamps in whole milliseconds": (
+        lambda: hec.calibrate(with_stamps_in(10**6), LIDAR),
+        "the parent has a pose every 100 ns, at stamps such as 17",
+    ),
+    "stamps in milliseconds beside a file": (
+        lambda: hec.calibrate("sample:lidar.tum", with_stamps_in(10**6)),
+        "they look like milliseconds; multiply them so that stamps_ns are",
     ),
     "stamps in seconds": (
         lambda: hec.Trajectory(LIDAR.stamps_ns / 1e9, LIDAR.poses),

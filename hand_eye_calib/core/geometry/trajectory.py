@@ -199,6 +199,11 @@ class Trajectory(Columns):
                     ": for positions alone, use "
                     "Trajectory.from_positions(stamps_ns, positions)"
                 )
+            elif poses.shape == (len(stamps_ns), 7):
+                hint = (
+                    ": for rows of x y z qx qy qz qw, use "
+                    "Trajectory.from_quat_xyzw(stamps_ns, rows[:, :3], rows[:, 3:])"
+                )
             raise InputError(
                 f"poses must have shape ({len(stamps_ns)}, 4, 4), one per stamp; "
                 f"found {poses.shape}{hint}"
@@ -514,6 +519,29 @@ def check_poses(poses: FloatArray) -> None:
             f"pose {int(np.argmax(is_wrong))} is not a rigid transform: its 3x3 part is not a "
             f"rotation matrix within {ROTATION_TOLERANCE} (scaled or left-handed axes?)"
         )
+    _check_last_rows(poses)
+
+
+def _check_last_rows(poses: FloatArray) -> None:
+    """Raise InputError for the first of the poses (N, 4, 4) whose last row is not 0 0 0 1."""
+    is_wrong = _differs_from_last_row(poses[:, 3])
+    if is_wrong.any():
+        index = int(np.argmax(is_wrong))
+        hint = "is it a pose (4, 4)?"
+        if not _differs_from_last_row(poses[:, :, 3]).any():
+            hint = (
+                "the poses seem to be transposed; pass poses.transpose(0, 2, 1)"
+            )
+        found = " ".join(f"{number:.4g}" for number in poses[index, 3])
+        raise InputError(
+            f"pose {index}: the last row must be 0 0 0 1; found {found}: {hint}"
+        )
+
+
+def _differs_from_last_row(rows: FloatArray) -> BoolArray:
+    """Whether rows (N, 4) differ from the last row of a pose."""
+    deviations = np.abs(rows - np.array([0.0, 0.0, 0.0, 1.0]))
+    return np.asarray(deviations.max(axis=1, initial=0.0) > ROTATION_TOLERANCE)
 
 
 def are_earth_centred(positions: FloatArray) -> bool:

@@ -165,6 +165,19 @@ def _amounts(sizes: Mapping[str, float]) -> str:
     return listing(texts)
 
 
+def _revealed(sizes: Mapping[str, float]) -> str:
+    """Describe the errors that a recording reveals; none on axes with an infinite size."""
+    hidden = tuple(
+        axis for axis, size in sizes.items() if not math.isfinite(size)
+    )
+    texts = []
+    if amounts := _amounts(sizes):
+        texts.append(f"only errors above {amounts}")
+    if hidden:
+        texts.append(f"no error in {axes_in_words(hidden)}")
+    return " and ".join(texts)
+
+
 def promised_error(measured: float, allowance: float) -> float:
     """Return the detectable error that follows from the standard deviation of a result.
 
@@ -203,7 +216,7 @@ def find_undetectable(result: Any) -> Iterator[Ground]:
             promises[axis] = promised
     if sizes:
         sentence = (
-            f"the recording reveals only errors above {_amounts(sizes)}; by its standard "
+            f"the recording reveals {_revealed(sizes)}; by its standard "
             f"deviations, it should reveal errors above {_amounts(promises)}"
         )
         axes = tuple(sizes)

@@ -6,6 +6,7 @@ names that programs use for it. The kind of data is "poses", "positions", "rotat
 """
 
 import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
 
 from hand_eye_calib.core.base.config import STAMP_UNITS
@@ -62,9 +63,9 @@ _BEGINNINGS = {
     "v": "v",
     "q": "q q_ o quat_ quaternion_ rot_ orientation_ rotation_",
 }
-# Names of each quantity, in lower case, with underscores between words. A file that was exported
-# from a bag has a whole path such as .pose.pose.position.x as the name of a column. The end of the
-# path is compared with the names.
+# Names of each quantity, in lower case without accents, with underscores between words. A file
+# that was exported from a bag has a whole path such as .pose.pose.position.x as the name of a
+# column. The end of the path is compared with the names.
 _NAMES = {
     "header": "header_stamp",
     "t": "t ts time timestamp timestamps stamp gpstime gps_time sim_time tracking_timestamp "
@@ -81,13 +82,13 @@ _NAMES = {
         axis: _POSITION_NAMES.format(axis, number, names)
         for number, (axis, names) in enumerate(_DIRECTIONS.items())
     },
-    "lat": "lat latitude",
-    "lon": "lon long lng longitude",
+    "lat": "lat latitude breitengrad",
+    "lon": "lon long lng longitude langengrad laengengrad",
     "height": "height ht h_ell h_msl height_msl ellipsoid_height ellipsoidal_height altitude alt "
-    "elevation ele",
-    "roll": "roll roll_angle",
-    "pitch": "pitch pitch_angle",
-    "yaw": "yaw yaw_angle theta",
+    "elevation ele hohe hoehe hauteur altura quota",
+    "roll": "roll roll_angle rollwinkel wankwinkel roulis alabeo rollio",
+    "pitch": "pitch pitch_angle nick nickwinkel tangage cabeceo beccheggio",
+    "yaw": "yaw yaw_angle theta gier gierwinkel lacet guinada imbardata",
     "heading": "heading true_heading platform_heading hdg azimuth",
     "secs": "stamp_secs stamp_sec secs sec",
     "nsecs": "stamp_nsecs stamp_nanosec stamp_nsec nsecs nanosec nsec",
@@ -348,6 +349,78 @@ _STAMPS = (
 )
 
 
+# Parts of the names of accuracies and rates, which are no part of a pose.
+_NO_POSE = re.compile(r"std|sd|sigma|cov|err|acc|rms|unc|dop|rate|vel|speed")
+# Number of angles of an orientation.
+_N_ANGLES = 3
+
+
+def unknown_columns(
+    names: Sequence[str], columns: Mapping[str, list[int]]
+) -> list[int]:
+    """Return the columns with a name that is not the name of a quantity."""
+    known = {place for places in columns.values() for place in places}
+    return [
+        place
+        for place, name in enumerate(names)
+        if name.strip(" _") and place not in known
+    ]
+
+
+def unknown_angles(
+    names: Sequence[str], units: Sequence[str], unknown: Sequence[int]
+) -> list[int]:
+    """Return the columns of an orientation with unknown names; empty if there is none.
+
+    These are three unknown columns with a unit of angle.
+
+    Parameters
+    ----------
+    names, units : (N,) sequence of str
+        Names and units of all columns.
+    unknown : sequence of int
+        Columns with unknown names.
+    """
+    angles = [
+        place
+        for place in unknown
+        if units[place] in ("deg", "rad")
+        and not _NO_POSE.search(plain_name(names[place]))
+    ]
+    return angles if len(angles) == _N_ANGLES else []
+
+
+def proposed_names(
+    units: Sequence[str],
+    columns: Mapping[str, list[int]],
+    unknown: Sequence[int],
+    angles: Sequence[int],
+) -> str:
+    """Return names for all columns, such as "t,x,y,z,roll_deg,pitch_deg,yaw_deg,_".
+
+    Without a known height, the only other unknown column in a unit of length is the height.
+    ``units``, ``unknown`` and ``angles`` are those of :func:`unknown_angles`; ``columns`` are the
+    known columns.
+    """
+    quantities = dict.fromkeys(range(len(units)), "_")
+    for quantity, places in columns.items():
+        for place in places:
+            if quantities[place] == "_":
+                quantities[place] = quantity
+    quantities |= dict(zip(angles, ("roll", "pitch", "yaw"), strict=False))
+    lengths = [
+        place for place in unknown if units[place] in ("m", "cm", "mm", "ft")
+    ]
+    if len(lengths) == 1 and not {"z", "height"} & columns.keys():
+        quantities[lengths[0]] = "height" if "lat" in columns else "z"
+    return ",".join(
+        "_".join(filter(None, [quantities[place], unit.replace("/", "_")]))
+        if quantities[place] != "_"
+        else "_"
+        for place, unit in enumerate(units)
+    )
+
+
 def stamp_columns(columns: Mapping[str, list[int]]) -> Sequence[str]:
     """Return the quantities that together are the stamp; empty if they have no columns.
 
@@ -376,7 +449,7 @@ def _split(name: str) -> tuple[str, str]:
 
     ``.pose.position.x [mm]`` becomes pose_position_x and mm; wx_deg_s becomes wx and deg/s.
     """
-    name = name.strip().lower()
+    name = _without_accents(name.strip().lower())
     # An index such as in q[0] or T[0][3] is not a unit in brackets. Write it as q_0_.
     if re.search(r"\[\d\]$", name):
         name = re.sub(r"\[(\d)\]", r"_\1_", name)
@@ -393,6 +466,14 @@ def _split(name: str) -> tuple[str, str]:
     if in_brackets and name.endswith(("]", ")")):
         return "_".join(words), _unit_in_brackets(in_brackets[-1])
     return _split_words(words)
+
+
+def _without_accents(text: str) -> str:
+    """Return a text with plain letters instead of letters with accents."""
+    letters = unicodedata.normalize("NFD", text)
+    return "".join(
+        letter for letter in letters if not unicodedata.combining(letter)
+    )
 
 
 def _unit_in_brackets(text: str) -> str:

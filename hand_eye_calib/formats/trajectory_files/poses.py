@@ -133,7 +133,9 @@ def _positions(table: Table) -> tuple[FloatArray, FloatArray | None]:
         names = ("x", "y", *up)
         positions[:, : len(names)] = _in_si(table, names, "length")
     if not up and {"x", "lat"} & table.at.keys():
-        table.guess("no column of heights: 0 is assumed")
+        # Without orientations, another note lists the unread columns.
+        unread = table.unread if table.measures == "poses" else ""
+        table.guess(f"no column of heights: 0 is assumed{unread}")
     _refuse_far(table, positions)
     return positions, to_first
 

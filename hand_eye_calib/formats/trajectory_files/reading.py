@@ -24,7 +24,10 @@ from hand_eye_calib.core.base.text import (
     listing,
     without_poses,
 )
-from hand_eye_calib.core.geometry.trajectory import Trajectory, TrajectoryLike
+from hand_eye_calib.core.geometry.trajectory import (
+    Trajectory,
+    TrajectoryLike,
+)
 from hand_eye_calib.formats.bags.patterns import has_suffix_of_bag
 from hand_eye_calib.formats.files import local_path
 from hand_eye_calib.formats.saved_results import refuse_saved_result
@@ -38,6 +41,7 @@ from hand_eye_calib.formats.trajectory_files.stamps import (
     in_order,
     refuse_coarse,
     refuse_milliseconds,
+    require_nanoseconds,
     stamps_in_ns,
 )
 from hand_eye_calib.formats.trajectory_files.table import Table
@@ -131,6 +135,7 @@ def read_trajectory(
     Trajectory(2 poses over 0.100 s)
     """
     if isinstance(source, Trajectory):
+        require_nanoseconds("the trajectory", source)
         return source
     path = (
         local_path(fspath(source))
@@ -417,7 +422,7 @@ def _read(
             table.sensor_frame,
         )
     if table.measures not in ("poses", "rates"):
-        table.guess(f"{table.measures} only, by its columns")
+        table.guess(f"{table.measures} only, by its columns{table.unread}")
     measures = table.measures if options.measures == AUTO else options.measures
     if measures != "poses":
         trajectory = replace(trajectory, measures=measures)

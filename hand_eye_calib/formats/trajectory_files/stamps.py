@@ -11,6 +11,7 @@ from hand_eye_calib.core.base.config import STAMP_UNITS, CalibratorConfig
 from hand_eye_calib.core.base.errors import InputError
 from hand_eye_calib.core.base.stats import median
 from hand_eye_calib.core.base.text import duration, shortened
+from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.formats.files import LONGEST_NAME
 from hand_eye_calib.formats.trajectory_files.dates import (
     DAY_S,
@@ -32,6 +33,16 @@ _SIMILAR = 3
 _FIRST_PACKED = Decimal(20_000_101_000_000)
 # Dates with a time of day as a number are below this: 2100-01-01.
 _END_OF_PACKED = Decimal(21_000_101_000_000)
+# Smallest stamp, largest stamp and 1970-01-01 on each clock that counts days: of spreadsheets
+# (since 1899-12-30), of MATLAB (datenum) and of astronomers (Julian day).
+_CLOCKS_OF_DAYS = (
+    (20_000, 80_000, Decimal(25_569)),
+    (690_000, 770_000, Decimal(719_529)),
+    (2_430_000, 2_500_000, Decimal("2440587.5")),
+)
+# Mean time (s) between poses, read in seconds, below which such stamps count days: no sensor of
+# poses is faster than 10 kHz.
+_SHORTEST_INTERVAL_S = 1e-4
 # Stamps have lost their last digits if this share of the poses, or more, have moved without a new
 # stamp.
 _COARSE_SHARE = 0.25
@@ -39,6 +50,43 @@ _COARSE_SHARE = 0.25
 _SHORT_STEP_S = 1e-3
 # Poses are equal, up to rounding, if no number differs by more than this.
 _SAME = 1e-12
+# Smallest number of poses and smallest mean interval (ns) of a stream; closer stamps have another
+# unit.
+_FEWEST_STAMPS = 10
+_SHORTEST_INTERVAL_NS = 1e5
+# Smallest stamp since 1970 in each unit: March 1973.
+_UNITS_SINCE_1970 = (
+    (10**14, "microseconds"),
+    (10**11, "milliseconds"),
+    (10**8, "seconds"),
+)
+
+
+def require_nanoseconds(name: str, trajectory: Trajectory) -> None:
+    """Raise InputError if the stamps of a whole stream seem to have another unit than ns.
+
+    No sensor of poses is faster than 10 kHz. A part of a stream is not checked: messages that were
+    received together may be closer.
+
+    Parameters
+    ----------
+    name : str
+        Name of the stream in the message.
+    trajectory : Trajectory
+    """
+    if len(trajectory) < _FEWEST_STAMPS:
+        return
+    interval_ns = trajectory.duration_s * 1e9 / (len(trajectory) - 1)
+    if interval_ns >= _SHORTEST_INTERVAL_NS:
+        return
+    largest = abs(int(trajectory.stamps_ns[-1]))
+    units = [unit for least, unit in _UNITS_SINCE_1970 if largest >= least]
+    unit = units[0] if units else "seconds or milliseconds"
+    raise InputError(
+        f"{name} has a pose every {interval_ns:.3g} ns, at stamps such as "
+        f"{trajectory.stamps_ns[0]}: they look like {unit}; multiply them so that stamps_ns are "
+        "nanoseconds (1 s is 1,000,000,000)"
+    )
 
 
 def _without_stamps(table: Table) -> str:
@@ -93,6 +141,8 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         and max(stamps) < _END_OF_PACKED
     ):
         stamps = _unpacked(stamps)
+    if not unit:
+        stamps = _from_days(table, stamps)
     magnitudes = np.abs(np.array(stamps, dtype=float))
     recognised = unit or _unit_of_magnitude(magnitudes.max())
     factor = STAMP_UNITS[recognised]
@@ -113,6 +163,26 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
     for period_s in (DAY_S, WEEK_S):
         stamps_ns = _without_restarts(stamps_ns, period_s)
     return stamps_ns
+
+
+def _from_days(table: Table, stamps: list[Decimal]) -> list[Decimal]:
+    """Return the seconds since 1970 of stamps that count days; other stamps are returned unchanged.
+
+    A note reports the conversion.
+    """
+    smallest = min(stamps)
+    largest = max(stamps)
+    interval_s = float(largest - smallest) / len(stamps)
+    if not 0.0 < interval_s < _SHORTEST_INTERVAL_S:
+        return stamps
+    for first, last, epoch in _CLOCKS_OF_DAYS:
+        if first <= smallest and largest <= last:
+            table.guess(
+                f"stamps such as {shortened(str(stamps[0]), 20)} read as days, as in a "
+                "spreadsheet; if they are seconds, set `stamp_unit` s"
+            )
+            return [DAY_S * (stamp - epoch) for stamp in stamps]
+    return stamps
 
 
 def _unit_of_magnitude(largest: float) -> str:

@@ -33,7 +33,10 @@ from hand_eye_calib.formats.trajectory_files.columns import (
     UNNAMED,
     measured,
     named_columns,
+    proposed_names,
     stamp_columns,
+    unknown_angles,
+    unknown_columns,
 )
 from hand_eye_calib.formats.trajectory_files.dates import decimals, stamp_of
 
@@ -44,6 +47,9 @@ _ORIENTATIONS = (QUATERNION, SCALAR_FIRST, UNNAMED, ROTATION)
 # Largest number of different names in a column of sensors. A column with more names contains
 # something else, such as images.
 _MOST_SENSORS = 20
+
+# Longest list of unknown columns in a note, in characters.
+_LONGEST_LIST = 120
 
 # Number of rows that are converted together. It limits the memory for the texts of cells.
 _ROWS_AT_ONCE = 1000
@@ -97,11 +103,14 @@ class Table:
         Unit of the stamps; if empty, it is inferred from the size of the stamps.
     second_unit : str
         Unit of the time within a GPS week; empty if not stated in the name of the column.
+    unknown : list of int
+        Columns with a name that is not the name of a quantity.
 
     Raises
     ------
     InputError
-        If a column is missing, or several columns are the same quantity.
+        If a column is missing, if several columns are the same quantity, or if columns with unknown
+        names seem to be the orientations.
     """
 
     path: object
@@ -127,7 +136,11 @@ class Table:
             self.expected
             or f"{len(self.names)} columns: {self._listed(self.names)}"
         )
+        is_kind_set = self.measures != "auto"
         self.measures, quantities = measured(columns, self.names, self.measures)
+        self.unknown = unknown_columns(self.names, columns)
+        if self.measures == "positions" and not is_kind_set:
+            self._refuse_unknown_angles(columns, units)
         self.stamp_names = stamp_columns(columns)
         self._refuse_unclear_columns(columns, quantities)
         self.at = {name: columns[name][0] for name in quantities}
@@ -182,6 +195,30 @@ class Table:
                     f"{self.path}: each of the columns {listed} could be {name}; "
                     "name them with `columns`"
                 )
+
+    def _refuse_unknown_angles(
+        self, columns: Mapping[str, list[int]], units: Sequence[str]
+    ) -> None:
+        """Raise an InputError if columns with unknown names seem to be the orientations."""
+        angles = unknown_angles(self.names, units, self.unknown)
+        if angles:
+            listed = self._listed(self.names[place] for place in self.unknown)
+            proposal = proposed_names(units, columns, self.unknown, angles)
+            raise InputError(
+                f"{self.path}: columns with unknown names: {listed}; name all columns with "
+                f"`columns`, such as {proposal} (_ leaves a column out)"
+            )
+
+    @property
+    def unread(self) -> str:
+        """End of a note on missing quantities: the columns with unknown names; may be empty."""
+        if not self.unknown:
+            return ""
+        listed = ", ".join(self.names[place] for place in self.unknown)
+        return (
+            f"; not read: {shortened(listed, _LONGEST_LIST)} (if they are part of the poses, name "
+            "all columns with `columns`)"
+        )
 
     def _set_stamp_units(self, units: Sequence[str]) -> None:
         """Set the units of the stamps and of the time within a GPS week.
