@@ -194,20 +194,24 @@ def check(
         of_clock = _check_clock(parent, child, known_s, snapshot)
         findings = _explained(findings, by=of_clock)
     if calibration and not _has(findings, "time_offset"):
-        is_unrelated = _has(findings, "unrelated")
-        of_solve = _check_solved(snapshot, calibration, is_unrelated)
-        if calibration.measured == "rotations":
-            findings = _explained(findings, by=of_solve)
-        elif is_unrelated:
-            # A fault that is found nevertheless is the cause, and comes first.
-            findings = [*of_solve, *findings]
-        else:
-            findings += of_solve
+        findings = _with_solved(findings, snapshot, calibration)
     if hidden and not any(issue.makes_unusable for issue in findings):
         findings.append(unobservable_axes(hidden))
     # Lengths in another unit come first, because they cause the findings of the solve.
     findings.sort(key=lambda issue: issue.code != "lengths")
     return CheckResult(gravest_first(_without_repetitions(findings)))
+
+
+def _with_solved(
+    findings: list[Finding], snapshot: Snapshot, calibration: Calibration
+) -> list[Finding]:
+    """Return findings with those about the residuals of the solve."""
+    is_unrelated = _has(findings, "unrelated")
+    of_solve = _check_solved(snapshot, calibration, is_unrelated)
+    if calibration.measured == "rotations":
+        return _explained(findings, by=of_solve)
+    # Faults in spite of unrelated streams are their cause, and come first.
+    return [*of_solve, *findings] if is_unrelated else [*findings, *of_solve]
 
 
 def _has(findings: Sequence[Finding], code: str) -> bool:

@@ -135,13 +135,9 @@ def stamps_in_ns(table: Table, stamp_unit: str | None) -> IntArray:
         raise InputError(_without_stamps(table))
     unit = stamp_unit or table.stamp_unit
     stamps = table.stamps
-    if (
-        not unit
-        and min(stamps) >= _FIRST_PACKED
-        and max(stamps) < _END_OF_PACKED
-    ):
-        stamps = _unpacked(stamps)
     if not unit:
+        if min(stamps) >= _FIRST_PACKED and max(stamps) < _END_OF_PACKED:
+            stamps = _unpacked(stamps)
         stamps = _from_days(table, stamps)
     magnitudes = np.abs(np.array(stamps, dtype=float))
     recognised = unit or _unit_of_magnitude(magnitudes.max())

@@ -31,19 +31,7 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
     from hand_eye_calib.offline.cli.reading import is_plain_file
 
     for path in paths:
-        if Path(path).name == "metadata.yaml":
-            raise ConfigError(
-                f"{path} describes a bag: pass its folder, {Path(path).parent}"
-            )
-        names = re.split(r"[\s,]+", str(path).strip(" ,"))
-        are_several = len(names) > 1 and not Path(path).exists()
-        if are_several and all(Path(name).exists() for name in names):
-            raise ConfigError(
-                f"{len(names)} files in one argument: leave out the quotes and commas: "
-                f"{shlex.join(names)}"
-            )
-        if isinstance(path, Path):
-            refuse_saved_result(path)
+        _refuse_wrong_path(path)
     if len(paths) == 3:
         last = Path(paths[-1])
         may_be_input = last.suffix or last.exists() or "*" in str(last)
@@ -60,6 +48,23 @@ def refuse_wrong_paths(command: str, paths: Sequence[Path | str]) -> None:
             "replay is for bags and journals; for trajectory files: hand_eye_calib "
             f"calibrate {shlex.join(map(str, paths))}"
         )
+
+
+def _refuse_wrong_path(path: Path | str) -> None:
+    """Raise an error for one path that no command can calibrate from."""
+    if Path(path).name == "metadata.yaml":
+        raise ConfigError(
+            f"{path} describes a bag: pass its folder, {Path(path).parent}"
+        )
+    names = re.split(r"[\s,]+", str(path).strip(" ,"))
+    are_several = len(names) > 1 and not Path(path).exists()
+    if are_several and all(Path(name).exists() for name in names):
+        raise ConfigError(
+            f"{len(names)} files in one argument: leave out the quotes and commas: "
+            f"{shlex.join(names)}"
+        )
+    if isinstance(path, Path):
+        refuse_saved_result(path)
 
 
 def calibrating(words: Sequence[str]) -> str:

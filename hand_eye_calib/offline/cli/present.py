@@ -127,11 +127,20 @@ def deliver(
             write_report(
                 arguments.out, calibration, snapshot, inputs, pictures=pictures
             )
+    _write_result_files(calibration, snapshot, arguments)
+    return end([calibration])
+
+
+def _write_result_files(
+    calibration: Calibration,
+    snapshot: "Snapshot | None",
+    arguments: argparse.Namespace,
+) -> None:
+    """Write the files of extras that the user asked for."""
     for name, file in RESULT_FILES.items():
         if path := getattr(arguments, name, None):
             file.write(path, calibration, snapshot)
             note(f"wrote {path}")
-    return end([calibration])
 
 
 def _saved(calibration: Calibration, directory: Path, inputs: Document) -> str:
@@ -412,24 +421,6 @@ def next_steps(
     """Return sentences and commands that improve the result; empty if the verdict is USE."""
     if calibration.verdict is Verdict.USE:
         return []
-    from hand_eye_calib.core.engine.run import options_to_solve
-
-    options: dict[str, object] = {}
-    for reason in shown(calibration.reasons):
-        options |= reason.options
-    # An estimated scale has an uncertainty. The value of a time offset is kept, because its
-    # estimate may fail.
-    for found in calibration.findings:
-        if "scale" in options and "scale" in found.options:
-            options["scale"] = options_to_solve(found)["scale"]
-    # An option that is set already has not repaired the streams. A command with a value that the
-    # user must still measure would not run.
-    current = snapshot.config.to_options() if snapshot else {}
-    options = {
-        name: value
-        for name, value in not_typed(arguments.typed, options).items()
-        if value not in (PLACEHOLDER, current.get(name))
-    }
     steps = []
     if calibration.verdict is not Verdict.DO_NOT_USE:
         if motion := _missing_motion(calibration, snapshot):
@@ -445,9 +436,35 @@ def next_steps(
     is_contradicted = calibration.status is SolveStatus.CONTRADICTED
     if not is_contradicted and not has_error(calibration.findings):
         steps += advice_of(calibration)
-    if options:
+    if options := _options_of_next_command(calibration, arguments, snapshot):
         steps.append(command_with(arguments.typed, options))
     return steps
+
+
+def _options_of_next_command(
+    calibration: Calibration,
+    arguments: argparse.Namespace,
+    snapshot: "Snapshot | None",
+) -> dict[str, object]:
+    """Return the options, by name, that the reasons propose and that are not set already."""
+    from hand_eye_calib.core.engine.run import options_to_solve
+
+    options: dict[str, object] = {}
+    for reason in shown(calibration.reasons):
+        options |= reason.options
+    # An estimated scale has an uncertainty. The value of a time offset is kept, because its
+    # estimate may fail.
+    for found in calibration.findings:
+        if "scale" in options and "scale" in found.options:
+            options["scale"] = options_to_solve(found)["scale"]
+    # An option that is set already has not repaired the streams. A command with a value that the
+    # user must still measure would not run.
+    current = snapshot.config.to_options() if snapshot else {}
+    return {
+        name: value
+        for name, value in not_typed(arguments.typed, options).items()
+        if value not in (PLACEHOLDER, current.get(name))
+    }
 
 
 def _missing_motion(

@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -152,21 +153,7 @@ class Watcher:
         limited. The list of topics is for a person whose input has no poses.
         """
         topics = self._node.get_topic_names_and_types()
-        for topic, types in topics:
-            name, _, last = topic.rpartition("/")
-            is_state = (
-                last == PROGRESS_TOPIC
-                and name
-                and "std_msgs/msg/String" in types
-            )
-            if (
-                is_state
-                and name not in self._sources
-                and len(self._sources) < _MAX_NAMES
-            ):
-                self._sources.add(name)
-                take = partial(self._take, name)
-                self._node.create_subscription(String, topic, take, LATCHED)
+        self._subscribe(topics)
         self._board.shared_names = self._shared_names(time.monotonic())
         poses = []
         for topic, types in topics:
@@ -183,6 +170,24 @@ class Watcher:
         self._board.topics = tuple(
             lines or ["no other topic with poses is published here"]
         )
+
+    def _subscribe(self, topics: Sequence[tuple[str, Sequence[str]]]) -> None:
+        """Subscribe to the states of new nodes, given all topics with their types."""
+        for topic, types in topics:
+            name, _, last = topic.rpartition("/")
+            is_state = (
+                last == PROGRESS_TOPIC
+                and name
+                and "std_msgs/msg/String" in types
+            )
+            if (
+                is_state
+                and name not in self._sources
+                and len(self._sources) < _MAX_NAMES
+            ):
+                self._sources.add(name)
+                take = partial(self._take, name)
+                self._node.create_subscription(String, topic, take, LATCHED)
 
     def _shared_names(self, now_s: float) -> frozenset[str]:
         """Return the names that several nodes have, and have had for some time."""
