@@ -158,7 +158,7 @@ def arranged(
 
     The criteria are, in order: the number of sensors whose kind matches the layout, the number
     whose kind contradicts it, the order of the layouts, and a parent before the child in
-    ``_ROLES``.
+    ``_RANKS``.
     """
     roles = (role_of(parent_frame), role_of(child_frame))
     best_score: tuple[Any, ...] = ()

@@ -219,8 +219,8 @@ def _quantile(values: Sequence[float], share: float) -> float:
 def over_robust_least_squares(scores: Sequence[Score]) -> list[float]:
     """Return the errors over those of robust least squares on the same recordings.
 
-    Translation and rotation of a recording are two ratios. Recordings without an error of either
-    are skipped.
+    Each recording has two ratios, of translation and of rotation. A ratio is skipped if one of its
+    two errors is zero.
     """
     ratios = []
     for score in scores:

@@ -461,7 +461,7 @@ def test_the_index_page_shows_each_vehicle(tmp_path):
     (lost,) = [row for row in rows_of(page) if row[2] == "failed"]
     assert (lost[0], lost[-1], rows_of(page)[0]) == ("lost", "no <bag>", lost)
     assert page.count("<svg") == 2
-    assert page.count("is left out: it does not belong to the others") == 2
+    assert page.count("is left out: its result disagrees with the others") == 2
     assert "path/fleet.yaml" not in page
     assert [row[4] for row in rows_of(page)] == [0] + 8 * [1]
     assert re.fullmatch(r"-?\d\.\d+ \d\.\d+", rows_of(page)[1][-1][0])

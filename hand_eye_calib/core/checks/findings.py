@@ -249,8 +249,9 @@ def answered(
 ) -> list[Finding]:
     """Return findings with the severity that they have under a configuration.
 
-    A finding becomes a note if the configuration has all options that repair the fault. Few jumps
-    become a note if the method rejects outliers. Axes with a prior are not called unknown.
+    A finding becomes a note if the configuration has all options that repair the fault. The
+    finding about jumps becomes a note if they are few and the method rejects outliers. Axes with a
+    prior are not called unknown.
     """
     current = config.to_options()
     graded_findings = []

@@ -460,12 +460,13 @@ class FrameTree:
         ----------
         frame, of : str
         moving : mapping, optional
-            For edges that move: name of the frame to its poses (..., 4, 4) in its parent.
+            For edges that move: name of the frame to its poses (..., 4, 4) in its parent. Other
+            edges that move then keep their last pose.
 
         Raises
         ------
         InputError
-            If a frame is missing, or an edge between both frames moves and is not in ``moving``.
+            If a frame is missing, or an edge between both frames moves and ``moving`` is empty.
         """
         up, down = self.route(frame, of)
         T_frame_of = np.eye(4)

@@ -246,7 +246,7 @@ def together(results: Mapping[str, Calibration]) -> Calibration:
     agreement = agreement_of_results([*usable.values()])
     names = [*usable]
     for index in agreement.apart:
-        left_out[names[index]] = "it does not belong to the others"
+        left_out[names[index]] = "its result disagrees with the others"
     used = {
         name: result for name, result in usable.items() if name not in left_out
     }

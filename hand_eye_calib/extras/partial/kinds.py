@@ -65,7 +65,8 @@ _COARSE_INTERVALS = 0.2
 
 # Time offsets (s) that are tried if speeds are not correlated. The solve estimates the remainder.
 _TRIED_OFFSETS_S = tuple(np.round(np.arange(-0.9, 0.95, 0.1), 3).tolist())
-# A tried offset is accepted if it multiplies the unexplained share of the path by less than this.
+# A tried offset is accepted if the unexplained share of the path falls below this fraction of the
+# share without an offset.
 _CLEAR_SHARE = 0.5
 
 
@@ -146,9 +147,10 @@ def _solve_rotations(
 def _solve(
     snapshot: Snapshot, estimate: Callable[..., Calibration]
 ) -> Calibration:
-    """Estimate the extrinsic. If the time offset is large, pair the streams anew and repeat.
+    """Estimate the extrinsic. If the time offset changes much, pair the streams anew and repeat.
 
-    A change of the time offset by more than ``UNASKED_S`` is rejected.
+    A change by ``UNASKED_S`` or more is not believed: the result then keeps its extrinsic, with the
+    time offset of the configuration.
     """
     config = snapshot.config
     result = estimate(snapshot.pose_pairs, config)

@@ -204,7 +204,10 @@ def _tile(place: int, label: str, image: Any, stop: Reprojection) -> str:
 
 
 def _part_of_image(shape: Sequence[int], pixels: FloatArray) -> tuple[Any, Any]:
-    """Return the first and the last column and row (2,) of the part around some pixels (n, 2)."""
+    """Return the part of an image around some pixels (n, 2), as two corners (column, row).
+
+    The second corner is the end, which is not in the part.
+    """
     size = np.array([shape[1], shape[0]])
     extent = np.ptp(pixels, axis=0)
     half = (0.5 + _AROUND) * extent.max() * np.array([1.0, _HEIGHT / _WIDTH])

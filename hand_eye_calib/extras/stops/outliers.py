@@ -23,9 +23,10 @@ _MAX_LISTED = 8
 
 
 def check_left_out(fit: RobotWorld, stops: Stops) -> list[Finding]:
-    """Return a finding with the numbers (from 1) of the stops with weight 0, if one is clear.
+    """Return a finding that lists all stops with weight 0 (numbers from 1).
 
-    The count is that of all stops with weight 0. Only clear outliers decide about the severity.
+    It requires at least one clear outlier among them. Only the clear outliers decide about the
+    severity.
     """
     is_left_out = fit.weights == 0.0
     is_clear = _squared_distances(fit, stops) > _MIN_REPORTED_SQUARED

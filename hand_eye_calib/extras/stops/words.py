@@ -42,7 +42,8 @@ WORDS = {
         code="unrelated",
     ),
     "disagreeing_stops": FindingWords(
-        "no camera and target explain {share:.0%} of the {part} of these stops",
+        "with the best mounting and target, {share:.0%} of the {part} of these stops remain "
+        "unexplained",
         "check axes and conventions of both sides, that the camera and the target are fixed, and "
         "that rows belong together",
         "positions of another frame than the rotations, a target or a camera that moved, wrong "
@@ -114,7 +115,7 @@ WORDS = {
     ),
     "turning_about_one_axis": FindingWords(
         "the stops do not turn about two axes",
-        "turn the hand about at least two axes between them",
+        "between the stops, turn the hand about at least two axes",
         severity=Severity.NOTE,
         code="one_axis",
     ),

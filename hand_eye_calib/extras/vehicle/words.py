@@ -17,7 +17,7 @@ WORDS = {
         code="unrelated",
     ),
     "upside_down": FindingWords(
-        "the wheels turn the other way than the sensor, if the sensor is upright",
+        "by its wheels, the vehicle turns left when an upright sensor turns right",
         "exchange the columns of the left and the right wheel, or change the sign of the steering "
         "angle or of the speed; if the sensor really is upside down, confirm it: "
         "prior.roll {roll}deg+/-10deg",

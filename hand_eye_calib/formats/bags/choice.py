@@ -177,14 +177,17 @@ def _partners(
     sensors: Sequence[_Candidate],
     frame_of: Callable[[str], str],
 ) -> Sequence[TopicInfo]:
-    """Return the topics that may be the second stream, beside the stream of one of ``sensors``."""
+    """Return the topics that may be the second stream, beside the stream of one of ``sensors``.
+
+    ``n_missing`` is the number of streams that the user has not named.
+    """
     partners = topics
     if len(sensors) == 1 and sensors[0].frame:
         # The other stream must be from another sensor.
         frame = sensors[0].frame
         partners = [topic for topic in topics if frame_of(topic.name) != frame]
     if n_missing == 1:
-        # Wheels are always the parent. The user may already have named the parent.
+        # Wheels can only be the parent, and the stream that the user named may be the parent.
         partners = [
             topic for topic in partners if topic.type != messages.JOINTS_TYPE
         ]

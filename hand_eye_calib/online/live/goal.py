@@ -455,8 +455,9 @@ class Goal:
     def _in_steps(self, left_s: FloatArray) -> list[float]:
         """Round times left (7,), of six axes and in all, to steps that decrease slowly.
 
-        Estimates of the time left jump from result to result. Therefore the reported time increases
-        only if the new value is longer by several steps, is unknown, or follows an unknown value.
+        Estimates of the time left jump from result to result. Therefore the reported time decreases
+        by a few steps at most, or at once to 0. It increases only by several steps, to or from an
+        unknown value, or from 0 to the smallest step.
         """
         before = self._steps
         infinite = len(_STEPS_S) - 1

@@ -331,6 +331,7 @@ def _facts(state: NodeState, is_old: bool) -> str:
 def _health(state: NodeState, is_old: bool) -> Iterator[Line]:
     """Yield a line for each input, for the stream checks and for the journal.
 
+    Without a result, a line of the solver contains the reason, if there is one.
     Lines of an old state have no tones, because conditions may have changed.
     """
     for name, part in state.parts():
