@@ -262,7 +262,7 @@ def test_the_one_axis_that_motion_does_not_show_is_that_of_what_is_installed(
         observability_measured=tuple(dofs),
         covariance_measured=covariance,
     )
-    heard = Heard(monkeypatch, installed="7 8 9 0 0 0")
+    heard = Heard(monkeypatch, installed="7m 8m 9m 0 0 0")
     T = heard.robot.complete(hidden).T_parent_child
     assert_allclose(T[:2, 3], known_pose.T_parent_child[:2, 3], atol=1e-4)
     assert T[2, 3] == pytest.approx(9.0)
