@@ -80,14 +80,28 @@ def free_domain():
         # Above 101, the ports overlap with those that Linux gives to clients.
         domain = 1 + candidate % 100
         port = 7410 + 250 * domain
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.bind(("", port))
-                _held[domain] = socket.create_server(("", port))
-            except OSError:
-                continue
+        if _has_participant(port):
+            continue
+        try:
+            _held[domain] = socket.create_server(("", port))
+        except OSError:
+            continue
         return domain
     raise RuntimeError("no free ROS domain")
+
+
+def _has_participant(first_port):
+    """Whether a participant, such as the node of a test run that was killed, is in a domain.
+
+    Every second port from the first one on belongs to a participant.
+    """
+    for number in range(5):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("", first_port + 2 * number))
+            except OSError:
+                return True
+    return False
 
 
 def release_domain(domain):
