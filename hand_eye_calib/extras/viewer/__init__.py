@@ -30,11 +30,9 @@ def _add_arguments(group: Any) -> None:
 
 def _new_folder(text: str) -> Path:
     """Return the path of a new folder. Raises a ConfigError if the folder exists."""
-    path = Path(text)
-    if not text.strip():
-        raise ConfigError(
-            "the name is empty: name a new folder, such as viewer/"
-        )
+    from hand_eye_calib.offline.cli.paths import directory
+
+    path = directory(text)
     if path.exists():
         raise ConfigError(
             f"{path} exists, and no file is overwritten: name a new folder"

@@ -17,7 +17,8 @@ from hand_eye_calib.core.geometry.trajectory import Trajectory
 from hand_eye_calib.core.pairing.motion_pairs import PosePairs
 from hand_eye_calib.core.results.calibration import Calibration
 from hand_eye_calib.formats.bags.writer import write_bag
-from hand_eye_calib.offline.report.style import LOOK
+from hand_eye_calib.offline.report.evidence import rotation_between_worlds
+from hand_eye_calib.offline.report.figures import evenly_spaced_rows
 
 _TF = "tf2_msgs/msg/TFMessage"
 _PATH = "nav_msgs/msg/Path"
@@ -89,9 +90,9 @@ def _between_worlds(
 
     The rotation is the mean over the pose pairs. The translation is then the median.
     """
+    Ts_cw_p = pose_pairs.Ts_cw_c @ se3.inverse(T_parent_child)
+    rotation = rotation_between_worlds(pose_pairs, Ts_cw_p)
     Ts_pw_c = pose_pairs.Ts_pw_p @ T_parent_child
-    Ts_pw_cw = Ts_pw_c @ se3.inverse(pose_pairs.Ts_cw_c)
-    rotation = se3.nearest_rotation(se3.rotation_of(Ts_pw_cw).mean(axis=0))
     positions = se3.translation_of(pose_pairs.Ts_cw_c) @ rotation.T
     differences = se3.translation_of(Ts_pw_c) - positions
     return se3.from_rotation_translation(
@@ -101,6 +102,4 @@ def _between_worlds(
 
 def _thinned(trajectory: Trajectory) -> Trajectory:
     """Return as many poses as a figure has, evenly chosen, with the first and the last."""
-    count = min(len(trajectory), LOOK.max_points)
-    rows = np.linspace(0, len(trajectory) - 1, count).round().astype(int)
-    return trajectory[rows]
+    return trajectory[evenly_spaced_rows(len(trajectory))]

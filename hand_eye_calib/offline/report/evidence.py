@@ -273,12 +273,17 @@ def _paths_of_poses(
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     parent = se3.translation_of(pose_pairs.Ts_pw_p)
-    child = se3.translation_of(Ts_cw_p) @ _between_worlds(pose_pairs, Ts_cw_p).T
+    child = (
+        se3.translation_of(Ts_cw_p)
+        @ rotation_between_worlds(pose_pairs, Ts_cw_p).T
+    )
     child = child + np.median(parent - child, axis=0)
     return parent - parent[0], child - parent[0]
 
 
-def _between_worlds(pose_pairs: PosePairs, Ts_cw_p: FloatArray) -> FloatArray:
+def rotation_between_worlds(
+    pose_pairs: PosePairs, Ts_cw_p: FloatArray
+) -> FloatArray:
     """Return the mean rotation (3, 3) from the child's world to the parent's world.
 
     ``Ts_cw_p`` (N, 4, 4) are the parent's poses in the child's world.
@@ -301,7 +306,9 @@ def _angles(
     """
     Ts_cw_p = pose_pairs.Ts_cw_c @ calibration.T_child_parent
     measured = se3.rotation_of(pose_pairs.Ts_pw_p)
-    computed = _between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(Ts_cw_p)
+    computed = rotation_between_worlds(pose_pairs, Ts_cw_p) @ se3.rotation_of(
+        Ts_cw_p
+    )
     steps_rad = se3.rotations_between(measured[:-1], measured[1:])
     measured_rad = np.vstack([np.zeros(3), np.cumsum(steps_rad, axis=0)])
     errors_rad = se3.rotations_between(measured, computed)

@@ -234,7 +234,7 @@ def _name_plane(plane: Axes, first: int, second: int) -> None:
 @page_style()
 def _figure_of_paths(calibration: Calibration, evidence: Evidence) -> Drawn:
     """Draw both paths of a sensor: in the plane of motion, and across this plane over time."""
-    rows = _downsample(len(evidence.times_s))
+    rows = evenly_spaced_rows(len(evidence.times_s))
     factor, unit = _time_axis(evidence.times_s[-1])
     first, second, across = _axes_of_motion(evidence.parent)
     figure, (plane, side) = make_panels(3.75, 1, 2)
@@ -296,7 +296,7 @@ def _figure_of_columns(
 
     ``labels`` are those of the vertical axes. Return the figure and a line of each curve.
     """
-    rows = _downsample(len(evidence.times_s), LOOK.max_coordinate_points)
+    rows = evenly_spaced_rows(len(evidence.times_s), LOOK.max_coordinate_points)
     factor, unit = _time_axis(evidence.times_s[-1])
     times = evidence.times_s[rows] * factor
     figure, panels = make_panels(5.1, 3, 2, sharex=True)
@@ -406,7 +406,7 @@ def _figure_of_track(
         distances_m = np.linalg.norm(path - turn, axis=1)
         distances.append(length(float(np.median(distances_m))))
         side.plot(times, 100 * distances_m, color=colour)
-    rows = _downsample(len(turn), LOOK.max_dots)
+    rows = evenly_spaced_rows(len(turn), LOOK.max_dots)
     dots = turn[rows]
     plane.plot(
         dots[:, first],
@@ -533,7 +533,7 @@ def _draw_residuals(
     """
     dots = np.flatnonzero(~is_out)
     crosses = np.flatnonzero(is_out)
-    dots = dots[_downsample(len(dots))]
+    dots = dots[evenly_spaced_rows(len(dots))]
     crosses = crosses[np.argsort(-values[crosses])[: LOOK.max_points]]
     used = (times[dots], values[dots], "o")
     marked = (times[crosses], values[crosses], "x")
@@ -557,7 +557,9 @@ def _time_axis(duration_s: float) -> tuple[float, str]:
     return (1.0, "s") if duration_s < 300 else (1 / 60, "min")
 
 
-def _downsample(count: int, max_points: int = LOOK.max_points) -> IntArray:
+def evenly_spaced_rows(
+    count: int, max_points: int = LOOK.max_points
+) -> IntArray:
     """Return indices of evenly spaced points of ``count``, with the first and the last point."""
     n_points = min(count, max_points)
     rows = np.linspace(0, count - 1, n_points).round().astype(int)
